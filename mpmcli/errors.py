@@ -23,5 +23,5 @@ class RunError(MpmcliError):
     exit_code = 1
 
 
-class NoRoomError(RunError):
+class DiskFullError(RunError):
     """What is to be written does not fit onto the disk: everything written before stays."""

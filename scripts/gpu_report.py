@@ -66,10 +66,10 @@ def usual_arch() -> str:
 def machine(arch: str) -> str:
     """Return a line about the machine and its device."""
     from mpmcli.bench.report import describe_machine
-    from mpmcli.doctor.devices import device_names
+    from mpmcli.doctor.examination import device_names
 
     facts = describe_machine()
-    names = ", ".join(device.name for device in device_names(arch)) or facts["processor"]
+    names = ", ".join(name for name, _ in device_names(arch)) or facts["processor"]
     commit = said(["git", "rev-parse", "--short", "HEAD"])
     driver = said(["nvidia-smi", "--query-gpu=driver_version,memory.total", "--format=csv,noheader"]).replace(
         "\n", "; "

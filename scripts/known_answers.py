@@ -8,9 +8,8 @@ import math
 import numpy as np
 
 from mpmcli.output.result import Result
-from mpmcli.validation.cases.dam_break import N_SQUARED, mean_error, measured
-from mpmcli.validation.cases.dam_break_obstacle import FILM, IMPACT, impact, water_height
-from mpmcli.validation.cases.dam_break_obstacle import measured as gauges
+from mpmcli.validation.cases.dam_break import FILM, IMPACT, N_SQUARED, impact, mean_error, measured, water_height
+from mpmcli.validation.cases.dam_break import measured_gauges as gauges
 from mpmcli.validation.cases.elliptical_drop import half_axis
 
 # How much later than assumed the column may have been free to move, in T: the gate takes its time.

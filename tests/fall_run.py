@@ -12,7 +12,7 @@ from solver_state import scene_of
 
 from mpmcli.errors import InputError
 from mpmcli.scene import Scene
-from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.run import build_run
 from mpmcli.solver.frames.diagnosis import UnstableRunError
 from mpmcli.solver.machine.backend import Backend, start_backend
 

@@ -11,8 +11,7 @@ from mpmcli.frames.ledger import LedgerRow
 from mpmcli.scene import BodyParticles, Scene
 from mpmcli.solver.engine.batch import Batch
 from mpmcli.solver.engine.compiled_kind import CompiledKind
-from mpmcli.solver.engine.run import Run
-from mpmcli.solver.frames.diagnosis import UnstableRunError
+from mpmcli.solver.engine.run import Run, frames_of_all
 from mpmcli.solver.machine.backend import Backend
 
 H, FRAMES = 0.1, 20
@@ -49,21 +48,14 @@ def let_go(
     """Run `starts` starts of `count` particles for about `steps` default steps, moving by up to three cells."""
     asked = [_asked(material, *start_of(count, k, sizes), steps) for k in range(starts)]
     batch = Batch(CompiledKind.of(*asked[0]), backend, starts)
-    streams = {k: Run(batch, k, scene, particles).events() for k, (scene, particles) in enumerate(asked)}
+    runs = {k: Run(batch, k, scene, particles) for k, (scene, particles) in enumerate(asked)}
     rows: list[list[LedgerRow]] = [[] for _ in asked]
     stopped = [""] * starts
-    while streams:
-        for k, stream in list(streams.items()):
-            try:
-                while (event := next(stream)) is not None:
-                    rows[k].append(event[1])
-            except StopIteration:
-                del streams[k]
-            except UnstableRunError as error:
-                stopped[k] = str(error)
-                del streams[k]
-        if streams:
-            batch.launch()
+    for k, event in frames_of_all(runs):
+        if isinstance(event, tuple):
+            rows[k].append(event[1])
+        elif event is not None:
+            stopped[k] = str(event)
     return [Outcome(_growth(own), tuple(own), why) for own, why in zip(rows, stopped, strict=True)]
 
 

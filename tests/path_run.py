@@ -13,8 +13,7 @@ import numpy as np
 from mpmcli.errors import InputError
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import BodyParticles, Scene, parse_scene, sample_bodies
-from mpmcli.solver.engine.build import build_run
-from mpmcli.solver.engine.run import Run
+from mpmcli.solver.engine.run import Run, build_run
 from mpmcli.solver.frames.diagnosis import read_group
 from mpmcli.solver.machine.backend import Backend, start_backend
 

@@ -15,8 +15,8 @@ from command import run_here
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output import SegmentStore, open_result
+from mpmcli.output.layout import PACKED
 from mpmcli.output.run_record import RECORD
-from mpmcli.output.segments import PACKED
 
 FORMS = ("packed", "segments")
 # A drop falls on the floor and splashes, and a jelly ball falls freely; it starts in no time.

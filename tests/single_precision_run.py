@@ -8,7 +8,7 @@ from dataclasses import fields
 
 from test_batch import scene_named
 
-from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.run import build_run
 from mpmcli.solver.machine.backend import Backend, start_backend
 
 

@@ -47,7 +47,7 @@ TRANSFERS = (
         ("0.75 - (distance", "0.7875 - (distance", "bar_fixed_fixed"),
         ("0.5 * (1.5 - distance) ** 2", "0.525 * (1.5 - distance) ** 2", "bar_fixed_fixed"),
     ),
-    *_of("solver/transfer/volume_average.py", ("exp(missing * ti", "exp(0.95 * missing * ti", "cook")),
+    *_of("solver/transfer/volume.py", ("exp(missing * ti", "exp(0.95 * missing * ti", "cook")),
     *_of("stability/transfer_factors.py", ('"quadratic": 4', '"quadratic": 4.2', "bar_fixed_fixed")),
     *_of(
         "solver/transfer/node_update.py",
@@ -79,7 +79,7 @@ TRANSFERS = (
 DRIVES = (
     *_of(
         "solver/engine/cpu_phases.py",
-        ("self.values[w, KICK] * pull", "1.05 * self.values[w, KICK] * pull", "take_off"),
+        ("step.kick * ti.cast", "1.05 * step.kick * ti.cast", "take_off"),
     ),
     *_of(
         "solver/drive/forces.py",
@@ -97,8 +97,8 @@ DRIVES = (
     ),
     *_of(
         "solver/engine/step_size.py",
-        ("0.5 * (numbers[w, self.real.last_step] + dt)", "0.525 * (numbers[w, self.real.last_step] + dt)", "take_off"),
-        ("numbers[w, self.real.time] + dt\n", "numbers[w, self.real.time] + 1.05 * dt\n", "bar_fixed_fixed"),
+        ("0.5 * (run.last_step + dt)", "0.525 * (run.last_step + dt)", "take_off"),
+        ("run.time + dt\n", "run.time + 1.05 * dt\n", "bar_fixed_fixed"),
     ),
     *_of(
         "scene/sampling.py",

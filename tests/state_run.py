@@ -5,8 +5,7 @@ import sys
 
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import Scene, parse_scene
-from mpmcli.solver.engine.build import build_run
-from mpmcli.solver.engine.run import Run
+from mpmcli.solver.engine.run import Run, build_run
 from mpmcli.solver.engine.saved_state import SavedState
 from mpmcli.solver.machine.backend import start_backend, stop_backend
 
@@ -40,9 +39,9 @@ RAFT = {
 WHEEL = {
     "name": "wheel",
     "mass": 30.0,
-    "shape": {"box": {"min": [0.7, 0.3], "max": [0.78, 0.7]}},
+    "shape": {"box": {"min": [0.78, 0.3], "max": [0.86, 0.7]}},
     "restitution": 0.5,
-    "joint": {"type": "hinge", "point": [0.74, 0.6], "motor": "8 * t", "strength": 60.0},
+    "joint": {"type": "hinge", "point": [0.82, 0.6], "motor": "8 * t", "strength": 60.0},
 }
 # By the name of each scene: the materials of its bodies, its dimension, and further tables.
 SCENES = {name: ((name,), 2, {}) for name in MATERIALS} | {
@@ -101,7 +100,7 @@ def advance(run: Run, steps: int) -> None:
 def saved_of(run: Run) -> SavedState:
     """Return the state of a run, less the steps of its next launch, which follow from wall times."""
     saved = run.save().copied()
-    saved.arrays["counts"][run.batch.layout.count.budget] = 0
+    saved.arrays["counts"][run.batch.layout.counts["budget"]] = 0
     return saved
 
 

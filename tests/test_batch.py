@@ -12,11 +12,10 @@ from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import Scene, parse_scene, sample_bodies
-from mpmcli.solver.engine import exchange
+from mpmcli.solver.engine import run as engine_run
 from mpmcli.solver.engine.batch import Batch
-from mpmcli.solver.engine.build import build_run
 from mpmcli.solver.engine.compiled_kind import CompiledKind
-from mpmcli.solver.engine.run import Run
+from mpmcli.solver.engine.run import Run, build_run, frames_of_all
 from mpmcli.solver.frames.diagnosis import UnstableRunError
 
 # By name: materials, dimension, and further tables of the scene.
@@ -171,20 +170,12 @@ def batch_of(scenes: Sequence[Scene], backend: object) -> Batch:
 
 def outputs_of(batch: Batch, scenes: Sequence[Scene]) -> list[Output | MpmcliError]:
     """Run a scene in each place of a batch, all at once; a run that stops gives its error."""
-    streams = [Run(batch, slot, scene).events() for slot, scene in enumerate(scenes)]
     found: list = [[] for _ in scenes]
-    open_streams = dict(enumerate(streams))
-    while open_streams:
-        for slot, stream in list(open_streams.items()):
-            try:
-                while (event := next(stream)) is not None:
-                    found[slot].append(event)
-            except StopIteration:
-                del open_streams[slot]
-            except MpmcliError as error:
-                found[slot] = error
-                del open_streams[slot]
-        batch.launch()
+    for slot, event in frames_of_all({slot: Run(batch, slot, scene) for slot, scene in enumerate(scenes)}):
+        if isinstance(event, Exception):
+            found[slot] = event
+        elif event is not None:
+            found[slot].append(event)
     return found
 
 
@@ -267,15 +258,12 @@ def test_an_unstable_run_stops_alone(backend_of: Callable) -> None:
     wild = sound.model_copy(update={"time": time})
     batch = batch_of([sound, wild], backend_of("f32", 1))
     runs = [Run(batch, 0, sound), Run(batch, 1, wild, force=True)]
-    streams, found, errors = [run.events() for run in runs], [[], []], [None, None]
-    for _ in range(1000):
-        for slot, stream in enumerate(streams):
-            try:
-                while (event := next(stream, None)) is not None:
-                    found[slot].append(event)
-            except UnstableRunError as error:
-                errors[slot] = error
-        batch.launch()
+    found, errors = [[], []], [None, None]
+    for slot, event in frames_of_all(dict(enumerate(runs))):
+        if isinstance(event, tuple):
+            found[slot].append(event)
+        elif event is not None:
+            errors[slot] = event
     again = outputs_of(batch, [wild.model_copy(update={"time": sound.time}), sound])
     assert list(same(again[1], found[0])) == []
     # A fresh backend numbers its fields from 0, and finds the kernels that it has compiled before.
@@ -317,8 +305,8 @@ def test_kinds_are_equal_where_flags_are() -> None:
 
 def test_frames_stop_on_request(backend_of: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
     """Between two launches, after the frames that were recorded until then."""
-    monkeypatch.setattr(exchange, "FIRST", 1)
-    monkeypatch.setattr(exchange, "LAUNCH", 0.0)
+    monkeypatch.setattr(engine_run, "FIRST", 1)
+    monkeypatch.setattr(engine_run, "LAUNCH", 0.0)
     scene = scene_named("sand")
     run = Run(batch_of([scene, scene_named("sand", other=True)], backend_of("f32", 1)), 0, scene)
     frames = run.frames(stop=lambda: run.step_count > 0)

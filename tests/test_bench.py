@@ -3,6 +3,7 @@
 import json
 import time
 from collections.abc import Callable
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
@@ -14,7 +15,7 @@ from pydantic import Field
 
 from mpmcli.bench import compare, ours, peers, profile, throughput
 from mpmcli.bench.cases import CASES, DENSITY, EDGE, GRAVITY, SPEED, BenchCase
-from mpmcli.bench.contestant import Side, run_block
+from mpmcli.bench.worker import Side, run_block
 from mpmcli.check.scene_check import check_scene
 from mpmcli.dataset.draw import draw
 from mpmcli.errors import RunError
@@ -119,7 +120,7 @@ class Clock:
 
 def test_a_block_lasts_as_long_as_asked(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = Clock()
-    monkeypatch.setattr("mpmcli.bench.contestant.time.perf_counter", lambda: clock.now)
+    monkeypatch.setattr("mpmcli.bench.worker.time.perf_counter", lambda: clock.now)
     steps, seconds, _ = run_block(clock, 1.0)
     assert seconds == pytest.approx(steps * 0.01)
     assert 1.0 <= seconds <= 1.02
@@ -130,16 +131,16 @@ class Local(Side):
     """A side in this process, with a clock of its own."""
 
     def __init__(self, name: str, make: Callable, *, by_processor: bool) -> None:
-        self.name, self.blocks, self.contestant, self._by_processor = name, [], make(), False
-        self.particles, self.threads = self.contestant.particles, self.contestant.threads
+        self.name, self.blocks, self.worker, self._by_processor = name, [], make(), False
+        self.particles, self.threads = self.worker.particles, self.worker.threads
         self.start_seconds, self.compile_seconds = 0.5, 1.5
 
     def ask(self, act: Callable, *arguments: object) -> object:
         if act is run_block:
-            steps = round(arguments[0] / self.contestant.seconds)
-            self.contestant.advance(steps)
-            return steps, steps * self.contestant.seconds, 0.0
-        return act(self.contestant, *arguments)
+            steps = round(arguments[0] / self.worker.seconds)
+            self.worker.advance(steps)
+            return steps, steps * self.worker.seconds, 0.0
+        return act(self.worker, *arguments)
 
     def close(self) -> None:
         pass
@@ -154,7 +155,7 @@ class Sleeper(Clock):
 
 
 def test_a_side_is_a_process() -> None:
-    with Side("sleeper", Sleeper, by_processor=False) as side:
+    with closing(Side("sleeper", Sleeper, by_processor=False)) as side:
         assert (side.particles, side.threads) == (7, 2)
         assert side.measure(0.01) >= 1 and side.cost > 0
         assert side.facts()["sound"]

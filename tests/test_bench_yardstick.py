@@ -60,7 +60,6 @@ for threads in (3, 1):
     assert side.is_sound()
     assert all(seconds > 0 for seconds in side.phases().values()), side.phases()
     found.append(side.state())
-    side.close()
 for one, other in zip(*found):
     np.testing.assert_array_equal(one, other)
 np.savez("found.npz", x=found[0][0], v=found[0][1])

@@ -14,11 +14,11 @@ from solver_state import bodies_of, scene_of
 from mpmcli.errors import InputError
 from mpmcli.frames.frame import Frame
 from mpmcli.scene import Scene, sample_bodies
-from mpmcli.scene.contact import Contact
+from mpmcli.scene.forces import Contact
 from mpmcli.solver.contact.layers import STICKS, Layers, require_contact_possible
 from mpmcli.solver.contact.surfaces import rest_surface
-from mpmcli.solver.engine.build import build_run
 from mpmcli.solver.engine.compiled_kind import CompiledKind
+from mpmcli.solver.engine.run import build_run
 from mpmcli.solver.machine.backend import Backend
 from mpmcli.solver.machine.plan import make_plan
 from mpmcli.validation.case import Setting

@@ -8,7 +8,7 @@ from scenes import block, scene
 
 from mpmcli.check.scene_limits import deformation_rate, scene_limits
 from mpmcli.scene import scene_bounds
-from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.run import build_run
 
 MATERIALS = {
     "fluid": {"law": "fluid", "density": 1000.0, "bulk_modulus": 1e5},

@@ -18,8 +18,8 @@ from mpmcli.output import SegmentStore
 from mpmcli.output.layout import FrameLayout
 from mpmcli.output.series import write_series
 from mpmcli.scene import scene_to_toml
-from mpmcli.solver.engine.build import build_run
-from mpmcli.solver.engine.run import Run
+from mpmcli.scene.schema import SolverSettings
+from mpmcli.solver.engine.run import Run, build_run
 from mpmcli.solver.frames.diagnosis import Diagnosis, UnstableRunError
 from mpmcli.solver.machine.plan import make_plan
 from mpmcli.solver.particles.sort import entry_count
@@ -158,8 +158,10 @@ def test_the_frames_and_the_asked_step_are_heeded() -> None:
 
 def test_the_loss_is_that_of_the_law() -> None:
     """0.024 (k h)^4 per step, and so more per second in smaller steps (docs/theory.md, 2.4)."""
-    assert wave_loss(2.0, 0.1, 1e-3) == pytest.approx(0.024 * (math.pi * 0.05) ** 4 / 1e-3)
-    assert wave_loss(2.0, 0.1, 1e-4) == pytest.approx(10 * wave_loss(2.0, 0.1, 1e-3))
+    assert wave_loss(2.0, 0.1, 1e-3, SolverSettings()) == pytest.approx(0.024 * (math.pi * 0.05) ** 4 / 1e-3)
+    assert wave_loss(2.0, 0.1, 1e-4, SolverSettings()) == pytest.approx(
+        10 * wave_loss(2.0, 0.1, 1e-3, SolverSettings())
+    )
 
 
 def test_the_command_probes_and_writes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,7 +21,7 @@ from mpmcli.frames.ledger import LedgerRow
 from mpmcli.materials.registry import laws
 from mpmcli.output.header import RunHeader
 from mpmcli.scene import LoadedScene, Scene, sample_bodies, scene_to_toml
-from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.run import build_run
 
 H, LENGTH = 0.1, 0.8
 SOUND = math.sqrt(SOLID["youngs_modulus"] / SOLID["density"])

@@ -17,10 +17,10 @@ from mpmcli.check.step_rules import NOTED_SHARE, chord, flow_width
 from mpmcli.scene import LoadedScene, Scene
 from mpmcli.scene.schema import USUAL_FLIP, SolverSettings
 from mpmcli.scene.shapes import Ball, Box, Polygon
-from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.run import build_run
 from mpmcli.stability.transfer_factors import impact_loss
 from mpmcli.validation.case import Setting
-from mpmcli.validation.cases.two_disks import CASES as TWO_DISKS
+from mpmcli.validation.cases import all_cases
 from mpmcli.validation.runs import scene_of as scene_of_case
 
 DENSITY, SOUND, NU = 1000.0, 20.0, 0.1
@@ -141,7 +141,7 @@ def test_an_impact_loses_what_was_foretold(backend_of: Callable, cells: int, saf
 
 def test_disks_that_collide_lose_what_was_foretold(backend_of: Callable) -> None:
     """The validation case of two disks at its coarsest, 8 cells across, within a factor of 2."""
-    case = TWO_DISKS[0]
+    case = all_cases()["two_disks"]
     scene = scene_of_case(case, 20, Setting())
     finding, _ = told(scene, "impact-loss")
     frames = list(build_run(scene, backend_of("f64", 1)).frames())

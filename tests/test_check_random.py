@@ -8,9 +8,8 @@ from random_drives import LAWS, random_scene
 from mpmcli.check.facts import SceneFacts
 from mpmcli.scene import sample_bodies
 from mpmcli.solver.engine.batch import Batch
-from mpmcli.solver.engine.build import build_run
 from mpmcli.solver.engine.compiled_kind import CompiledKind
-from mpmcli.solver.engine.run import Run
+from mpmcli.solver.engine.run import Run, build_run, frames_of_all
 
 # The predicted step may be this much larger than the smallest one taken.
 OPTIMISTIC = 1.1
@@ -27,17 +26,11 @@ def test_safe_throughout_is_not_optimistic(backend_of: Callable) -> None:
     for more in kinds[1:]:
         kind = kind.joined(more)
     batch = Batch(kind, backend_of("f32", 1), len(scenes))
-    streams = {k: Run(batch, k, scene).events() for k, scene in enumerate(scenes)}
     smallest = {}
-    while streams:
-        for k, stream in list(streams.items()):
-            try:
-                while (event := next(stream)) is not None:
-                    smallest[k] = event[1].step_min
-            except StopIteration:
-                del streams[k]
-        if streams:
-            batch.launch()
+    for k, event in frames_of_all({k: Run(batch, k, scene) for k, scene in enumerate(scenes)}):
+        assert not isinstance(event, Exception)
+        if event is not None:
+            smallest[k] = event[1].step_min
     for k, scene in enumerate(scenes):
         assert SceneFacts(scene).step <= OPTIMISTIC * smallest[k], k
 

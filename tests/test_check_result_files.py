@@ -14,8 +14,8 @@ from test_check_result import rules, the
 from mpmcli.check import result_check
 from mpmcli.check.result_check import check_result
 from mpmcli.errors import InputError
+from mpmcli.output.layout import PACKED, SEGMENTS, segment_name
 from mpmcli.output.run_record import RECORD
-from mpmcli.output.segments import PACKED, SEGMENTS, segment_name
 
 K = 6
 

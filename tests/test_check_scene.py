@@ -16,8 +16,8 @@ from mpmcli.check.scene_limits import JET
 from mpmcli.errors import InputError
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import load_scene, scene_bounds
-from mpmcli.scene.presets import PRESETS
-from mpmcli.solver.engine.build import build_run
+from mpmcli.scene.expand import PRESETS
+from mpmcli.solver.engine.run import build_run
 from mpmcli.solver.frames.diagnosis import UnstableRunError
 from mpmcli.stability.limits import COURANT, DEFORMATION
 

@@ -8,7 +8,7 @@ from check_scenes import FLUID, SOLID, box, check, loaded
 
 from mpmcli.check.facts import SceneFacts
 from mpmcli.check.scene_limits import Start, starts_of
-from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.run import build_run
 
 FREE = {"domain": {"gravity": [0.0, 0.0]}, "shape": box([0.3, 0.3], [0.5, 0.5])}
 SUCKING = FLUID | {"tension_cutoff": False}
@@ -46,4 +46,4 @@ def test_stored_energy_becomes_speed() -> None:
     facts = SceneFacts(loaded(**FREE, material=FLUID, deformation=0.2).scene)
     expected = np.sqrt(2 * FLUID["bulk_modulus"] * (0.2 - 1 - np.log(0.2)) / FLUID["density"])
     assert facts.bounds.speed == pytest.approx(expected)
-    assert facts.first_contact == 0.0
+    assert min(body.arrival.time for body in facts.bodies) == 0.0

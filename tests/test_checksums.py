@@ -18,7 +18,7 @@ import mpmcli.dataset
 from mpmcli.check.result_check import check_result
 from mpmcli.errors import InputError
 from mpmcli.output import SegmentStore, open_result
-from mpmcli.output.segments import PACKED, sealed_segments
+from mpmcli.output.layout import PACKED, sealed_segments
 
 GROUPS = ([12], [1] * 12, [5, 6, 1])
 

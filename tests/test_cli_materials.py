@@ -6,7 +6,7 @@ import pytest
 from command import run_here
 
 from mpmcli.materials.registry import laws
-from mpmcli.scene.presets import PRESETS
+from mpmcli.scene.expand import PRESETS
 
 
 def facts(*arguments: str) -> dict:

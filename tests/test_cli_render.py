@@ -15,11 +15,10 @@ from PIL import Image
 
 from mpmcli.materials.registry import parameter_models
 from mpmcli.output import Result, open_result
-from mpmcli.output.segments import SEGMENTS
+from mpmcli.output.layout import SEGMENTS
 from mpmcli.render.picture_file import settings_digest, write_picture
-from mpmcli.render.render_scene import APPEARANCES
+from mpmcli.render.render_scene import APPEARANCES, result_of_start
 from mpmcli.render.request import Request, plan_render
-from mpmcli.render.scene_start import result_of_start
 from mpmcli.render.settings import THEMES
 from mpmcli.scene import load_scene
 

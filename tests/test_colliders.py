@@ -13,7 +13,7 @@ from mpmcli.boundaries.loads import Loads
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.scene import Scene
-from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.run import build_run
 
 G = 10.0
 JELLY = {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 1e6, "poissons_ratio": 0.3}

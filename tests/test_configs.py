@@ -10,7 +10,7 @@ from command import CONFIGS, run_here
 from mpmcli.materials.registry import laws, parameter_models
 from mpmcli.output import open_result
 from mpmcli.scene import load_scene
-from mpmcli.scene.presets import PRESETS
+from mpmcli.scene.expand import PRESETS
 
 SCENES = sorted(CONFIGS.glob("*.toml"))
 # In 3D each has a twin in 2D of the same materials, and other scenes run in 3D. The dam break is the demo that

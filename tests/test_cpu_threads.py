@@ -7,10 +7,10 @@ from scenes import block, scene
 
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import sample_bodies
-from mpmcli.solver.engine.build import build_run
 from mpmcli.solver.engine.cpu_launch import CpuLaunch
-from mpmcli.solver.engine.cpu_phases import RunInts, RunReals, Shown
+from mpmcli.solver.engine.cpu_phases import FrameBuffer, RunInts, RunReals
 from mpmcli.solver.engine.cpu_threads import RESPECT
+from mpmcli.solver.engine.run import build_run
 
 FLUID = {"law": "fluid", "density": 1000.0, "bulk_modulus": 1e4}
 
@@ -23,14 +23,14 @@ class EarlyThread:
         self.team = launch.team
 
     @ti.kernel
-    def come(self, numbers: RunReals, counts: RunInts, shown: Shown) -> int:
+    def come(self, numbers: RunReals, counts: RunInts, frame_buffer: FrameBuffer) -> int:
         """Return what it finds to do, see `CpuThreads.help`."""
         found = 0
         ti.loop_config(serialize=True)
         for _ in range(1):
             self.team.open(0)
             self.team.enter(0)
-            found = self.team.help(0, 1, RESPECT, numbers, counts, shown)
+            found = self.team.help(0, 1, RESPECT, numbers, counts, frame_buffer)
         return found
 
 
@@ -39,12 +39,12 @@ def test_nothing_is_to_be_done_before_the_first_phase(backend_of: Callable) -> N
     start = scene((16, 16), 1 / 16, [block("pool", FLUID, (0, 0), (1, 0.5))], 0.01)
     run = build_run(start, backend_of("f32", 2), sample_bodies(start))
     batch = run.batch
-    shown = np.zeros((run.particle_count, 16), np.float32)
+    frame_buffer = np.zeros((run.particle_count, 16), np.float32)
     early = EarlyThread(batch.cpu)
-    assert early.come(batch.numbers, batch.counts, shown) == 0
+    assert early.come(batch.numbers, batch.counts, frame_buffer) == 0
     # Nor after a launch, whatever its last phase was.
     run.step(1e-4)
-    assert early.come(batch.numbers, batch.counts, shown) == 0
+    assert early.come(batch.numbers, batch.counts, frame_buffer) == 0
 
 
 def test_a_region_may_have_any_number_of_pencils(backend_of: Callable) -> None:

@@ -19,7 +19,7 @@ from mpmcli.dataset.shard import checksum
 from mpmcli.errors import InputError
 from mpmcli.output import open_result, read_record
 from mpmcli.plain_text import escaped
-from mpmcli.scene.geometry_file import GeometryFileError, read_geometry
+from mpmcli.scene.points import GeometryFileError, read_geometry
 from mpmcli.scene.toml_file import apply_overrides, copied, too_deep
 
 # A file of each kind, each of which once ended a command with a traceback.

@@ -10,10 +10,10 @@ import pytest
 from made_sweep import COUNT, VERDICTS, made_workers, make_dataset  # noqa: F401
 
 import mpmcli.dataset
-from mpmcli.dataset.card import DrawnComponent, first_paragraph, histogram, values_of, write_card
 from mpmcli.dataset.export import ExportSettings, export
 from mpmcli.dataset.folder import MANIFEST, Manifest
 from mpmcli.dataset.merge import merge
+from mpmcli.dataset.report import DrawnComponent, first_paragraph, histogram, values_of, write_card
 
 pytestmark = pytest.mark.usefixtures("made_workers")
 

@@ -26,7 +26,7 @@ def test_a_trajectory_reads_back_bit_for_bit(tmp_path, dimension, dtype, compres
     dataset = mpmcli.dataset.open(write_dataset(tmp_path / "set", [made], compress=compress))
     read = dataset[7]
     assert (read.number, read.split, read.draws) == (7, "valid", made.draws)
-    assert (read.frame_count, read.particle_count, dataset.dimension) == (11, 24, dimension)
+    assert (read.frame_count, read.particle_count, read.header.dimension) == (11, 24, dimension)
     assert read.header.stored == made.header and read.header.bodies[0].material["viscosity"] == 0.5
     assert read.ledger == made.ledger
     for name in ("position", "velocity", "body", "material"):
@@ -70,7 +70,7 @@ def test_datasets_and_trajectories_can_be_sent_to_other_processes(tmp_path):
 @pytest.mark.parametrize("form", ["packed", "segments"])
 def test_a_single_result_is_a_dataset_of_one_trajectory(tmp_path, form):
     dataset = mpmcli.dataset.open(write_made(tmp_path / "run", form, dimension=3))
-    assert dataset.splits == {"train": (0,), "valid": (), "test": ()} and dataset.dimension == 3
+    assert dataset.splits == {"train": (0,), "valid": (), "test": ()} and dataset[0].header.dimension == 3
     read = dataset[0]
     frames = [made_frame(k, 3) for k in range(6)]
     same(read.position, np.stack([frame.position for frame in frames]))

@@ -13,8 +13,7 @@ from solver_state import masses_of, scene_of
 from test_batch import batch_of, outputs_of, same, scene_named
 
 from mpmcli.scene import BodyParticles, Scene, sample_bodies
-from mpmcli.solver.engine.build import build_run
-from mpmcli.solver.engine.run import Run
+from mpmcli.solver.engine.run import Run, build_run
 from mpmcli.solver.frames.diagnosis import UnstableRunError, read_group
 from mpmcli.solver.grid.fixed_point import DENSEST, FixedSums
 from mpmcli.solver.machine.backend import Backend

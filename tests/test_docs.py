@@ -16,7 +16,7 @@ from command import ROOT
 
 from mpmcli.materials.registry import parameter_models
 from mpmcli.output import open_result
-from mpmcli.output.ledger_table import COLUMNS
+from mpmcli.output.layout import COLUMNS
 from mpmcli.scene import load_scene, parse_scene, scene_to_toml
 from mpmcli.scene.expression import FUNCTIONS
 

@@ -12,7 +12,6 @@ import pytest
 from command import ROOT, run_here
 
 from mpmcli.doctor import examination
-from mpmcli.doctor.devices import device_names
 from mpmcli.doctor.examination import CHECKS, OPTIONAL, Check, run_check
 
 
@@ -77,23 +76,22 @@ def test_a_full_disk_is_a_fault(monkeypatch: pytest.MonkeyPatch, tmp_path: Path)
     ],
 )
 def test_software_vulkan_is_named_as_such(monkeypatch: pytest.MonkeyPatch, devices, status, detail) -> None:
-    from mpmcli.doctor import devices as names
     from mpmcli.solver.machine import backend
 
     monkeypatch.setattr(backend, "backend_is_here", lambda arch: True)
     monkeypatch.setattr(backend, "try_backend", lambda arch: None)
-    monkeypatch.setattr(names, "device_names", lambda arch: [names.Device(*device) for device in devices])
+    monkeypatch.setattr(examination, "device_names", lambda arch: devices)
     assert (examination.taichi("vulkan").status, examination.taichi("vulkan").detail) == (status, detail)
 
 
 def test_the_driver_of_vulkan_names_its_devices() -> None:
-    devices = device_names("vulkan")
+    devices = examination.device_names("vulkan")
     if not devices:
         pytest.skip("there is no Vulkan device here, nor Mesa's software Vulkan")
-    for device in devices:
-        assert device.name.isprintable() and device.name
-        assert device.is_software or not device.name.startswith("llvmpipe")
-    assert device_names("metal") == []
+    for name, is_software in devices:
+        assert name.isprintable() and name
+        assert is_software or not name.startswith("llvmpipe")
+    assert examination.device_names("metal") == []
 
 
 def test_the_versions_of_python_are_those_of_the_package() -> None:

@@ -15,7 +15,7 @@ from mpmcli.check.result_check import check_result
 from mpmcli.check.scene_check import check_scene
 from mpmcli.output import open_result
 from mpmcli.scene import LoadedScene, Scene, sample_bodies, scene_to_toml
-from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.run import build_run
 from mpmcli.solver.machine.backend import Backend
 
 WATER = {"law": "fluid", "density": 1000.0, "bulk_modulus": 2e4}

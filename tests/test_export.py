@@ -18,7 +18,7 @@ from test_dataset_statistics import agree, plain
 import mpmcli.dataset
 from mpmcli.dataset.folder import MANIFEST, Manifest, Row
 from mpmcli.dataset.formats import FORMATS
-from mpmcli.dataset.thinned import chosen_particles, joined_row
+from mpmcli.dataset.subsample import chosen_particles, joined_row
 from mpmcli.output import open_result
 
 FORMS = tuple(FORMATS)

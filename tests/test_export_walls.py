@@ -12,8 +12,8 @@ import pytest
 from command import run_here
 from drawn_results import WATER, frame, header, lattice, row, write
 
-from mpmcli.dataset import thinned
-from mpmcli.dataset.thinned import ThinnedTrajectory, joined_row
+from mpmcli.dataset import subsample
+from mpmcli.dataset.subsample import SubsampledTrajectory, joined_row
 
 H = 0.05
 POST = {"name": "post", "shape": {"ball": {"center": [0.7, 0.5], "radius": 0.1}}}
@@ -153,7 +153,7 @@ def test_walls_inside_of_others_have_no_particles(tmp_path: Path) -> None:
 
 def test_walls_move_on_from_block_to_block(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A frame is a block."""
-    monkeypatch.setattr(thinned, "BLOCK_BYTES", 1)
+    monkeypatch.setattr(subsample, "BLOCK_BYTES", 1)
     path = run(tmp_path / "run", [POST, ROD])
     export(path, "lagrangebench", tmp_path / "out", "--walls", "colliders")
     with h5py.File(tmp_path / "out" / "train.h5") as file:
@@ -170,7 +170,7 @@ def test_the_impulse_of_left_out_frames_is_kept(stride: int) -> None:
         replace(row(time, 2), collider_force=((force, 0.0),), collider_torque=((2 * force,),))
         for time, force in zip(times, forces, strict=True)
     ]
-    found = ThinnedTrajectory.ledger(SimpleNamespace(source=SimpleNamespace(ledger=rows), stride=stride))
+    found = SubsampledTrajectory.ledger(SimpleNamespace(source=SimpleNamespace(ledger=rows), stride=stride))
     assert [one.time for one in found] == times[::stride].tolist()
     impulse = np.cumsum(forces * np.diff(times, prepend=0.0))[::stride]
     spans = np.diff(times[::stride], prepend=0.0)

@@ -9,7 +9,7 @@ from solver_state import scene_of
 from test_batch import batch_of, outputs_of, same
 
 from mpmcli.scene import Scene, sample_bodies
-from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.run import build_run
 
 H = 0.1
 E, NU, DENSITY = 1e5, 0.49, 1000.0
@@ -194,7 +194,7 @@ def test_a_uniform_change_of_volume_is_not_changed(backend_of: Callable) -> None
 )
 def test_who_averages(backend_of: Callable, material: dict, setting: object, averages: bool) -> None:
     run = build_run(block(material=material, law=material["law"], solver={"f_bar": setting}), backend_of("f64", 1))
-    assert run.groups[0].arrays.averaged == averages
+    assert run.groups[0].arrays.uses_f_bar == averages
     # The plan says so, and what does not average has no field for it.
     assert (run.groups[0].arrays.to_mean is not None) == averages == bool(run.grid.kept_means)
 

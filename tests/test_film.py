@@ -10,8 +10,7 @@ import pytest
 from PIL import Image
 
 from mpmcli.errors import InputError, RunError
-from mpmcli.render.film import write_film
-from mpmcli.render.picture_file import write_picture
+from mpmcli.render.picture_file import write_film, write_picture
 
 COUNT = 12
 HEIGHT, WIDTH = 48, 65  # odd on purpose

@@ -5,7 +5,7 @@ import pytest
 from scenes import block, stresses
 from solver_state import bodies_of, scene_of
 
-from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.run import build_run
 
 # So soft that nothing but what drives it moves it.
 CLOUD = {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 1e-6, "poissons_ratio": 0.3}

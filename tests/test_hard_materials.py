@@ -12,8 +12,7 @@ from scenes import GRAVITY, block, restart, scene
 
 from mpmcli.materials.registry import laws
 from mpmcli.scene import BodyParticles, sample_bodies
-from mpmcli.solver.engine.build import build_run
-from mpmcli.solver.engine.run import Run
+from mpmcli.solver.engine.run import Run, build_run
 from mpmcli.solver.frames.diagnosis import UnstableRunError
 
 H, CELLS, SIDE = 0.1, 16, 8

@@ -8,7 +8,7 @@ from solver_state import scene_of
 
 from mpmcli.scene import sample_bodies
 from mpmcli.scene.entry import value_of
-from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.run import build_run
 from mpmcli.solver.machine.backend import Backend
 
 JELLY = {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 1e4, "poissons_ratio": 0.3}

@@ -7,7 +7,7 @@ import pytest
 from solver_state import scene_of
 
 from mpmcli.scene import Scene
-from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.run import build_run
 from mpmcli.solver.machine.backend import Backend
 from mpmcli.solver.transfer.kept_motion import kept_share
 from mpmcli.validation.case import Setting
@@ -49,7 +49,7 @@ def test_n_short_steps_lose_what_one_does() -> None:
     ("scene", "kept"), [(meeting(1.0), False), (meeting(1.0, safety=0.1), True), (meeting(9.0), True)]
 )
 def test_only_scenes_with_short_steps_store_shares(backend_of: Callable, scene: Scene, kept: bool) -> None:
-    assert (build_run(scene, backend_of("f64", 1)).grid.scheme.keeps_before) == kept
+    assert (build_run(scene, backend_of("f64", 1)).grid.scheme.keeps_flip_velocity) == kept
 
 
 @pytest.mark.parametrize("solids", ["updated", pytest.param("total", marks=pytest.mark.slow)])

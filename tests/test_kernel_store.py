@@ -17,8 +17,8 @@ from solver_state import scene_of
 
 from mpmcli.scene import Scene, sample_bodies
 from mpmcli.solver.engine import batch, kernel_store
-from mpmcli.solver.engine.build import build_run
 from mpmcli.solver.engine.compiled_kind import CompiledKind
+from mpmcli.solver.engine.run import build_run
 from mpmcli.solver.machine.backend import Backend, choose_backend, start, stop_backend
 
 
@@ -153,7 +153,7 @@ def test_the_key_has_all_that_a_kernel_is_made_from(folder: Path, monkeypatch: p
         for _ in range(before):
             build_run(drop(), backend)
         run = build_run(scene, backend)
-        kind = CompiledKind.of(scene, sample_bodies(scene)).roomy()
+        kind = CompiledKind.of(scene, sample_bodies(scene)).padded()
         assert kind == run.batch.kind
         found = kernel_store.kernel_key(kind, backend, runs)
         stop_backend()

@@ -13,7 +13,7 @@ from mpmcli.errors import InputError
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import Scene, SolverSettings, parse_scene, scene_bounds, scene_to_toml
 from mpmcli.scene.schema import USUAL_FLIP
-from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.run import build_run
 from mpmcli.solver.frames.diagnosis import read_group
 from mpmcli.solver.machine.backend import Backend
 from mpmcli.solver.machine.plan import make_plan
@@ -42,7 +42,7 @@ def test_a_scene_that_chooses_nothing_has_nothing_of_it(backend_of: Callable) ->
     """No share of FLIP in the settings, and on the grid no momentum from before and no wider stencil."""
     assert small_scene().solver == SolverSettings(precision="f32", kernel="quadratic", transfer="apic", flip=None)
     run = build_run(small_scene(), backend_of("f32", 1))
-    assert not run.grid.scheme.keeps_before and run.grid.tile == 6
+    assert not run.grid.scheme.keeps_flip_velocity and run.grid.tile == 6
     assert run.grid.scheme.spline.nodes == 3 and run.grid.nodes.n == 4
 
 

@@ -8,7 +8,7 @@ import pytest
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import Scene, parse_scene
 from mpmcli.scene.schema import USUAL_FLIP
-from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.run import build_run
 from mpmcli.stability.transfer_factors import loss_per_step
 from mpmcli.validation.case import Setting
 from mpmcli.validation.cases.bar import PERIODS, Bar

@@ -11,8 +11,7 @@ from path_reference import Arrays, check_nodes, reference_groups
 from mpmcli.errors import InputError
 from mpmcli.scene import Scene
 from mpmcli.scene.schema import SolverSettings
-from mpmcli.solver.engine.build import build_run
-from mpmcli.solver.engine.run import Run
+from mpmcli.solver.engine.run import Run, build_run
 from mpmcli.solver.machine.backend import Backend
 from mpmcli.solver.transfer.splines import PAD
 

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from solver_state import bodies_of, scene_of
 
 from mpmcli.scene import sample_bodies
-from mpmcli.solver.engine.build import build_run
-from mpmcli.solver.engine.run import Run
+from mpmcli.solver.engine.run import Run, build_run
 from mpmcli.solver.frames.diagnosis import UnstableRunError
 from mpmcli.stability.limits import COURANT, DEFORMATION, FIX, WHY, Limit, deformation_limit, mode_limit, speed_limit
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from lone_particles import Outcome, let_go
 
-from mpmcli.check.result_ledger import ENERGY_SUSPECT, energy_change
+from mpmcli.check.result_check import ENERGY_SUSPECT, energy_change
 
 MATERIALS = {
     "fluid": {"law": "fluid", "density": 1000.0, "bulk_modulus": 1e5},

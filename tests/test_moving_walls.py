@@ -7,7 +7,7 @@ import pytest
 from solver_state import bodies_of, scene_of
 
 from mpmcli.scene import Scene
-from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.run import build_run
 from mpmcli.stability.limits import COURANT
 
 SOLID = {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 2e4, "poissons_ratio": 0.3}

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import pytest
 import state_run
 
-from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.run import build_run
 
 # Two bodies, and FLIP; forces are slow to compile.
 USUAL = ("several bodies, FLIP",)

@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
-from mpmcli.output.layout import FrameLayout
-from mpmcli.output.ledger_table import ledger_columns, ledger_rows
+from mpmcli.output.layout import FrameLayout, ledger_columns, ledger_rows
 
 # Fields by name: shape per particle as a function of d.
 FIELDS = {

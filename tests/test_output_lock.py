@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import asdict
 from pathlib import Path
 
 import pytest
@@ -35,7 +36,7 @@ def hold(directory: Path) -> subprocess.Popen[str]:
 
 def told(**changes: object) -> str:
     """Return what a lock file of this process tells, with changes."""
-    return json.dumps({"machine": "node7", "since": "2026-01-01T00:00:00+00:00", **Owner.here().as_dict(), **changes})
+    return json.dumps({"machine": "node7", "since": "2026-01-01T00:00:00+00:00", **asdict(Owner.here()), **changes})
 
 
 def test_the_holder_is_named_and_nothing_changes(tmp_path: Path) -> None:
@@ -122,7 +123,7 @@ def test_a_lock_of_another_machine_is_respected(tmp_path: Path) -> None:
 @pytest.mark.parametrize("content", ["", "{", "[]", '{"pid": "x"}', '{"pid": 1, "started": null}', "\x00" * 100])
 def test_a_damaged_lock_file_is_no_obstacle(tmp_path: Path, content: str) -> None:
     (tmp_path / LOCK).write_text(content, encoding="utf-8")
-    take_lock(tmp_path).release()
+    take_lock(tmp_path).close()
 
 
 def test_the_start_of_a_process_tells_it_from_one_of_the_same_number() -> None:

@@ -9,7 +9,7 @@ from test_output_segments import fill
 
 from mpmcli.errors import InputError
 from mpmcli.output import open_result
-from mpmcli.output.segments import sealed_segments
+from mpmcli.output.layout import sealed_segments
 
 
 def test_fields_can_be_left_out(tmp_path):

@@ -25,11 +25,9 @@ from vtkmodules.vtkIOHDF import vtkHDFReader
 from mpmcli.errors import InputError, RunError
 from mpmcli.output import SegmentStore, open_result
 from mpmcli.output import durable as durable_module
-from mpmcli.output import pack as pack_module
 from mpmcli.output import store as store_module
 from mpmcli.output.directory import take_directory
-from mpmcli.output.layout import FrameLayout
-from mpmcli.output.segments import sealed_segments
+from mpmcli.output.layout import FrameLayout, sealed_segments
 
 HEADER = {
     "dimension": 2,
@@ -410,7 +408,7 @@ def test_verification_catches_a_corrupted_pack(tmp_path, monkeypatch, name):
                 data.reshape(-1).view(np.uint8)[-4] ^= 1
                 f[name][...] = data
 
-    monkeypatch.setattr(pack_module, "sync_file", corrupt)
+    monkeypatch.setattr(store_module, "sync_file", corrupt)
     with pytest.raises(RunError, match=r"does not read back as it was written.*3 frames written are kept"):
         store.finish()
     assert [path.name for path in tmp_path.iterdir()] == ["segments"]
@@ -463,7 +461,7 @@ def test_an_interrupt_while_packing_leaves_the_segments(tmp_path, monkeypatch):
     def interrupt(path: Path) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(pack_module, "sync_file", interrupt)
+    monkeypatch.setattr(store_module, "sync_file", interrupt)
     with pytest.raises(KeyboardInterrupt):
         store.finish()
     assert os.listdir(tmp_path) == ["segments"]

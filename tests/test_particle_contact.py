@@ -8,7 +8,7 @@ import pytest
 from elastic_bodies import DENSITY, E, bars, stirred
 
 from mpmcli.scene import sample_bodies
-from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.run import build_run
 from mpmcli.solver.machine.backend import Backend
 
 

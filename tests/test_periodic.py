@@ -8,7 +8,7 @@ import pytest
 from solver_state import BodyState, bodies_of, scene_of
 
 from mpmcli.scene import BodyParticles, Scene, sample_bodies
-from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.run import build_run
 
 H = 0.125
 SOLID = {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 2e4, "poissons_ratio": 0.3}

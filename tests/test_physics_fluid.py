@@ -7,7 +7,7 @@ import pytest
 from scenes import GRAVITY, block, row_means, scene, tilted
 
 from mpmcli.scene import sample_bodies
-from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.run import build_run
 
 DENSITY = 1000.0
 

@@ -11,7 +11,7 @@ import pytest
 from scenes import GRAVITY, block, scene
 
 from mpmcli.scene import BodyParticles, Scene, sample_bodies
-from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.run import build_run
 
 DENSITY, H = 1600.0, 0.2
 

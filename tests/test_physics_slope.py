@@ -7,8 +7,7 @@ import pytest
 from scenes import GRAVITY, block, row_means, scene, stresses, tilted
 
 from mpmcli.scene import Scene, sample_bodies
-from mpmcli.solver.engine.build import build_run
-from mpmcli.solver.engine.run import Run
+from mpmcli.solver.engine.run import Run, build_run
 
 H = 0.1
 SAND, MUD = 1600.0, 1000.0

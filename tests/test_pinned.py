@@ -12,7 +12,7 @@ from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import Scene, parse_scene
-from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.run import build_run
 from mpmcli.validation.cases.cantilever import BELOW, LENGTH, THICKNESS, SmallBend
 
 JELLY = {"law": "fixed_corotated", "density": 1000.0, "youngs_modulus": 2e4, "poissons_ratio": 0.2}

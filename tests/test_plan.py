@@ -14,10 +14,9 @@ from mpmcli.errors import InputError
 from mpmcli.materials.registry import laws
 from mpmcli.output import SegmentStore
 from mpmcli.scene import Scene
-from mpmcli.solver.engine.build import build_run
-from mpmcli.solver.machine.backend import Backend, choose_backend, start, stop_backend
-from mpmcli.solver.machine.device_memory import has_cuda_device
-from mpmcli.solver.machine.plan import LawPlan, Plan, make_plan, require_room
+from mpmcli.solver.engine.run import build_run
+from mpmcli.solver.machine.backend import Backend, choose_backend, has_cuda_device, start, stop_backend
+from mpmcli.solver.machine.plan import LawPlan, Plan, make_plan, require_memory
 from mpmcli.solver.particles.sort import entry_count
 
 MATERIALS = {
@@ -216,10 +215,10 @@ def test_more_than_an_index_reaches_is_refused(
     )
     plan = make_plan(scene, Backend("cpu", threads, "f32", False))
     if fits:
-        require_room(plan)
+        require_memory(plan)
     else:
         with pytest.raises(InputError, match="more than 32-bit indices can address"):
-            require_room(plan)
+            require_memory(plan)
 
 
 class FakeDriver:
@@ -261,27 +260,25 @@ def test_a_run_on_cuda_needs_the_memory_of_the_device(monkeypatch: pytest.Monkey
     """10.1 GB on the device with its room: not of 10 GB that are free there, nor of the 1 GB that this machine has."""
     plan = Plan((LawPlan("fluid", 10**8, {"position": 100}),), 1000, 0, 16, 16000, 1, (), "cuda")
     driver = FakeDriver(10 * 10**9)
-    monkeypatch.setattr("mpmcli.solver.machine.device_memory.ctypes.CDLL", lambda name: driver)
+    monkeypatch.setattr("mpmcli.solver.machine.backend.ctypes.CDLL", lambda name: driver)
     monkeypatch.setattr("mpmcli.solver.machine.plan.psutil.virtual_memory", lambda: SimpleNamespace(available=10**9))
     with pytest.raises(InputError, match=r"10\.1 GB of memory on the cuda device, and 8 GB may be used there"):
-        require_room(plan)
+        require_memory(plan)
     driver.free *= 2
-    require_room(plan)
+    require_memory(plan)
     assert driver.uses == 0
     with pytest.raises(InputError, match=r"10\.1 GB of memory, and 800 MB may be used here"):
-        require_room(replace(plan, arch="cpu"))
-    monkeypatch.setattr("mpmcli.solver.machine.device_memory.ctypes.CDLL", lambda name: FakeDriver(0, present=False))
-    require_room(plan)
+        require_memory(replace(plan, arch="cpu"))
+    monkeypatch.setattr("mpmcli.solver.machine.backend.ctypes.CDLL", lambda name: FakeDriver(0, present=False))
+    require_memory(plan)
 
 
 def test_a_device_is_there_if_the_driver_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        "mpmcli.solver.machine.device_memory.Path", lambda name: SimpleNamespace(glob=lambda pattern: [])
-    )
-    monkeypatch.setattr("mpmcli.solver.machine.device_memory.os.path.exists", lambda name: False)
+    monkeypatch.setattr("mpmcli.solver.machine.backend.Path", lambda name: SimpleNamespace(glob=lambda pattern: []))
+    monkeypatch.setattr("mpmcli.solver.machine.backend.os.path.exists", lambda name: False)
     for present in (True, False):
         monkeypatch.setattr(
-            "mpmcli.solver.machine.device_memory.ctypes.CDLL",
+            "mpmcli.solver.machine.backend.ctypes.CDLL",
             lambda name, present=present: FakeDriver(1, present=present),
         )
         assert has_cuda_device() is present

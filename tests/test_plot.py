@@ -14,9 +14,8 @@ from made_result import GRAVITY, LIMITS, MASS, PAUSE, STEP, made_header, made_ro
 from PIL import Image
 
 from mpmcli.output import open_result
-from mpmcli.plot import history
-from mpmcli.plot.history import read_history
-from mpmcli.plot.ledger_figure import draw_ledger, ledger_picture
+from mpmcli.plot import ledger_figure
+from mpmcli.plot.ledger_figure import draw_ledger, ledger_picture, read_history
 from mpmcli.plot.style import THEMES, drawing
 from mpmcli.render.picture_file import settings_digest, write_picture
 
@@ -126,9 +125,9 @@ def test_the_reach_is_that_of_each_body_between_the_walls(result):
 
 
 def test_many_frames_are_read_evenly_and_that_is_said(result, monkeypatch):
-    monkeypatch.setattr(history, "FRAMES_MAX", 3)
+    monkeypatch.setattr(ledger_figure, "FRAMES_MAX", 3)
     seen = read_history(open_result(result))
-    assert np.allclose(seen.reach.times, TIMES[[0, 2, 5]]) or np.allclose(seen.reach.times, TIMES[[0, 3, 5]])
+    assert np.allclose(seen.reach_times, TIMES[[0, 2, 5]]) or np.allclose(seen.reach_times, TIMES[[0, 3, 5]])
     assert seen.notes == ("The reach of the particles is read from 3 of 6 frames.",)
 
 
@@ -242,7 +241,7 @@ def test_titles_may_hold_what_matplotlib_or_its_font_stumbles_over(tmp_path, rec
     with mock.patch("made_result.made_header", return_value=header):
         write_made(tmp_path / "result", frames=3)
     history = read_history(open_result(tmp_path / "result"))
-    assert history.title.startswith("costs $5, or $x^{ and 水 aaa") and history.reach.names == ("$left^{", "ri ght")
+    assert history.title.startswith("costs $5, or $x^{ and 水 aaa") and history.names == ("$left^{", "ri ght")
     picture, _ = ledger_picture(history, (400, 300), "light")
     # The first row of panels is not pushed down, nor the title beyond the edge.
     assert (picture[:, -3:] == 255).all()

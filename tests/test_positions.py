@@ -13,7 +13,7 @@ from mpmcli.check.finding import FrameFindings
 from mpmcli.check.result_state import StateCheck
 from mpmcli.output.header import RunHeader
 from mpmcli.scene import Scene
-from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.run import build_run
 
 # A block at 8.6 m that moves by a fifth of the spacing of the numbers there in a step, and one beside it that is fast.
 SPEED, STEP = 4e-4, 5e-4

@@ -15,7 +15,7 @@ from mpmcli.scene import LoadedScene, parse_scene
 from mpmcli.simulation import stored_run
 from mpmcli.simulation.settings import RunSettings
 from mpmcli.simulation.simulate import simulate
-from mpmcli.solver.engine import exchange
+from mpmcli.solver.engine import run as engine_run
 from mpmcli.solver.machine.backend import stop_backend
 
 FRAMES, LATER = 4, 7
@@ -53,8 +53,8 @@ def run(
 def at_once() -> object:
     """Seal each frame at once, in a thread, and launch a few steps at a time, so that a short run has many files."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(exchange, "FIRST", PARTICLES * STEPS)
-        patch.setattr(exchange.LaunchBudget, "took", lambda *_: None)
+        patch.setattr(engine_run, "FIRST", PARTICLES * STEPS)
+        patch.setattr(engine_run.LaunchBudget, "took", lambda *_: None)
         patch.setattr(stored_run, "HOLD", 0.0)
         patch.setattr(store, "ASIDE", 0)
         yield

@@ -8,8 +8,8 @@ import pytest
 from mpmcli.errors import InputError
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import LoadedScene, parse_scene, scene_to_toml
+from mpmcli.scene.expand import PRESETS
 from mpmcli.scene.material import Knob, knobs_of, unit_of
-from mpmcli.scene.presets import PRESETS
 
 LAWS = {str(model.model_fields["law"].default): model for model in parameter_models()}
 KNOBS = [(law, name) for law in sorted(LAWS) for name in knobs_of(LAWS[law])]

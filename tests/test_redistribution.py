@@ -15,8 +15,7 @@ from test_deterministic import on_gpu_path, twice
 
 from mpmcli.check.result_check import check_kept
 from mpmcli.scene import Scene
-from mpmcli.solver.engine.build import build_run
-from mpmcli.solver.engine.run import Run
+from mpmcli.solver.engine.run import Run, build_run
 from mpmcli.stability.transfer_factors import INTERVAL
 
 WATER = {"law": "fluid", "density": 1000.0, "bulk_modulus": 1e5}

@@ -23,16 +23,14 @@ from mpmcli.errors import InputError
 from mpmcli.materials.registry import parameter_models
 from mpmcli.output import SegmentStore, open_result
 from mpmcli.output.checkpoints import CHECKPOINTS, Checkpoint, read_checkpoints, write_checkpoint
-from mpmcli.output.layout import FrameIndex
-from mpmcli.output.segments import DAMAGED, sealed_segments
+from mpmcli.output.layout import DAMAGED, FrameIndex, sealed_segments
 from mpmcli.output.vtkhdf import read_index_of
 from mpmcli.scene import Scene, load_scene, parse_scene
-from mpmcli.simulation.checkpointing import Checkpointer
 from mpmcli.simulation.resume import Resumption, find_resumption, go_on, require_same_run, take_over
 from mpmcli.simulation.simulate import RunSettings, simulate
-from mpmcli.solver.engine import exchange
-from mpmcli.solver.engine.build import build_run
-from mpmcli.solver.engine.run import Run
+from mpmcli.simulation.stored_run import Checkpointer
+from mpmcli.solver.engine import run as engine_run
+from mpmcli.solver.engine.run import Run, build_run
 from mpmcli.solver.engine.saved_state import SavedState
 from mpmcli.solver.machine.backend import choose_backend, start, stop_backend
 
@@ -102,10 +100,10 @@ from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import load_scene
 from mpmcli.simulation import stored_run
 from mpmcli.simulation.simulate import RunSettings, simulate
-from mpmcli.solver.engine import exchange
+from mpmcli.solver.engine import run as engine_run
 scene, directory, form = sys.argv[1:]
-exchange.FIRST, stored_run.HOLD = 2000, 0.0
-exchange.LaunchBudget.took = lambda *_: None
+engine_run.FIRST, stored_run.HOLD = 2000, 0.0
+engine_run.LaunchBudget.took = lambda *_: None
 def told(row, summary):
     if summary.frames == 3:
         os.kill(os.getpid(), signal.SIGKILL)
@@ -125,8 +123,8 @@ def run_of(scene: Scene) -> Run:
 @pytest.fixture
 def short_launches(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let a run stop every few steps."""
-    monkeypatch.setattr(exchange, "FIRST", 2000)
-    monkeypatch.setattr(exchange.LaunchBudget, "took", lambda *_: None)
+    monkeypatch.setattr(engine_run, "FIRST", 2000)
+    monkeypatch.setattr(engine_run.LaunchBudget, "took", lambda *_: None)
 
 
 @pytest.mark.parametrize("data", [CHANGING, TOTAL], ids=["all that changes", "total"])
@@ -165,7 +163,7 @@ def test_a_run_that_goes_on_for_longer_knows_how_fast_its_colliders_become():
         states[end] = run.save().copied()
         bound = scene.domain.spacing / 2 / max(one.fastest(scene.domain, end) for one in scene.colliders)
     run.load(states[0.1])
-    assert run._row.number("collider") == pytest.approx(bound)
+    assert run.state.collider == pytest.approx(bound)
 
 
 def test_frames_of_a_forced_run_are_kept_by_no_other():
@@ -410,10 +408,8 @@ def test_frames_before_a_checkpoint_are_sealed(tmp_path: Path) -> None:
     for k in range(3):
         store.write(made_frame(k, 2), made_row(k, 2))
     assert store.frames_written == 0
-    saved = SimpleNamespace(
-        numbers={"frames": [3, 0, 0.0], "step_count": 30, "time": 0.05}, arrays=SizedArrays(a=np.zeros(3))
-    )
-    run = SimpleNamespace(save=lambda: saved)
+    saved = SimpleNamespace(numbers={"frames": [3, 0, 0.0]}, arrays=SizedArrays(a=np.zeros(3)))
+    run = SimpleNamespace(save=lambda: saved, step_count=30, time=0.05)
     backend = {"arch": "cpu", "precision": "f32"}
     Checkpointer(tmp_path, run, store, backend, size=1000, forced=False, every=0.0).take()
     (point,) = read_checkpoints(tmp_path)

@@ -12,10 +12,10 @@ from solver_state import scene_of
 
 from mpmcli.scene import sample_bodies
 from mpmcli.solver.engine import kernel_store
-from mpmcli.solver.engine.build import build_run
 from mpmcli.solver.engine.compiled_kind import CompiledKind
+from mpmcli.solver.engine.run import build_run
 from mpmcli.solver.machine.backend import choose_backend, start, stop_backend
-from mpmcli.solver.machine.room import FEWEST, in_steps, power_of_two, roomy_cells
+from mpmcli.solver.machine.plan import FEWEST, in_steps, padded_cells, power_of_two
 
 
 @given(st.integers(1, 2**31))
@@ -40,11 +40,11 @@ def test_there_are_few_sizes(count: int) -> None:
 @given(st.lists(st.integers(5, 3000), min_size=2, max_size=3))
 def test_a_grid_grows_by_a_sixteenth_along_an_axis_at_most(cells: list[int]) -> None:
     """Or to the next multiple of four cells: 15 % in 2D and 25 % in 3D at most from 65 cells on; of 16 or 8 below."""
-    roomy = roomy_cells(cells)
+    padded = padded_cells(cells)
     few = {2: 15, 3: 7}[len(cells)]
-    assert all(n <= r <= max(n + (few if n <= 64 else 3), n * 17 / 16) for n, r in zip(cells, roomy, strict=True))
+    assert all(n <= r <= max(n + (few if n <= 64 else 3), n * 17 / 16) for n, r in zip(cells, padded, strict=True))
     if min(cells) > 64:
-        assert math.prod(roomy) <= math.prod(cells) * {2: 1.15, 3: 1.25}[len(cells)]
+        assert math.prod(padded) <= math.prod(cells) * {2: 1.15, 3: 1.25}[len(cells)]
 
 
 SCENE = {
@@ -141,6 +141,6 @@ def test_edits_of_a_scene_compile_nothing(tmp_path: Path, monkeypatch: pytest.Mo
 
 def test_a_larger_kind_is_roomy_itself() -> None:
     scene = scene_of(**SCENE)
-    kind = CompiledKind.of(scene, sample_bodies(scene)).roomy()
-    assert kind.roomy() == kind
+    kind = CompiledKind.of(scene, sample_bodies(scene)).padded()
+    assert kind.padded() == kind
     assert kind.joined(CompiledKind.of(scene, sample_bodies(scene))) == kind

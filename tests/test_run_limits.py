@@ -11,9 +11,9 @@ from command import SCENE, run_here
 from mpmcli.cli.options import duration
 from mpmcli.cli.options import size as size_of
 from mpmcli.output import open_result
-from mpmcli.simulation import limits
-from mpmcli.simulation.limits import Halt, Limits
-from mpmcli.solver.machine.device_memory import is_out_of_memory
+from mpmcli.simulation import settings as limits
+from mpmcli.simulation.settings import Limits, StopCondition
+from mpmcli.solver.machine.backend import is_out_of_memory
 
 LONG = SCENE.replace("end = 0.05", "end = 5000.0").replace("frames = 4", "frames = 2000")
 
@@ -61,7 +61,7 @@ class Clock:
 def test_a_run_stops_in_time_to_pack(monkeypatch, written: int, seconds: float, compress: bool) -> None:
     """It asks every 3 s. What is left when it stops holds one more such pause and the packing."""
     clock = Clock(monkeypatch)
-    halt = Halt(lambda: False, Limits(max_time=100.0), compress=compress)
+    halt = StopCondition(lambda: False, Limits(max_time=100.0), compress=compress)
     halt.wrote(written, seconds)
     while not halt():
         clock.now += 3.0
@@ -76,7 +76,7 @@ def test_a_run_stops_in_time_to_pack(monkeypatch, written: int, seconds: float, 
 
 def test_packing_ends_soon_after_a_signal(monkeypatch) -> None:
     clock, said = Clock(monkeypatch), [""]
-    halt = Halt(lambda: said[0], Limits())
+    halt = StopCondition(lambda: said[0], Limits())
     assert not halt() and not halt.packing()
     said[0] = "SIGTERM"
     assert halt() and (halt.status, halt.signal) == ("interrupted", "SIGTERM")
@@ -88,7 +88,7 @@ def test_packing_ends_soon_after_a_signal(monkeypatch) -> None:
 def test_a_signal_during_packing_ends_it(monkeypatch) -> None:
     Clock(monkeypatch)
     said = [False]
-    halt = Halt(lambda: said[0], Limits())
+    halt = StopCondition(lambda: said[0], Limits())
     assert not halt()
     said[0] = True
     assert halt.packing() and halt.status == "interrupted"

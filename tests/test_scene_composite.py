@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from mpmcli.check.geometry import RESOLUTION, distance_between, thickness
 from mpmcli.errors import InputError
 from mpmcli.materials.registry import parameter_models
-from mpmcli.scene import Scene, Shape, parse_scene, sample_bodies, scene_to_toml
-from mpmcli.scene.shapes import Form, enclosed_volume
+from mpmcli.scene import Scene, parse_scene, sample_bodies, scene_to_toml
+from mpmcli.scene.shapes import Form, Shape, enclosed_volume
 
 
 def form_of(dimension: int, **tables: Any) -> Form:

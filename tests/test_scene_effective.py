@@ -16,11 +16,11 @@ from mpmcli.scene import (
     load_scene,
     parse_scene,
     sample_bodies,
-    scene_model,
     scene_to_toml,
 )
-from mpmcli.scene.presets import PRESETS
+from mpmcli.scene.expand import PRESETS
 from mpmcli.scene.quantity import Table
+from mpmcli.scene.schema import scene_model
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 SCENES = sorted(CONFIGS.glob("*.toml"))

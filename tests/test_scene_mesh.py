@@ -16,10 +16,10 @@ from mpmcli.dataset.sweep_file import load_sweep
 from mpmcli.errors import InputError
 from mpmcli.materials.registry import laws, parameter_models
 from mpmcli.output.header import RunHeader
-from mpmcli.scene import Ball, Scene, Shape, parse_scene, sample_bodies, scene_to_toml
-from mpmcli.scene.mesh import Mesh, MeshFileError, _surface_of, read_mesh
-from mpmcli.scene.shapes import distance_grid
-from mpmcli.scene.triangles import ClosedSurface
+from mpmcli.scene import Scene, parse_scene, sample_bodies, scene_to_toml
+from mpmcli.scene.mesh import ClosedSurface, Mesh, _surface_of, read_mesh
+from mpmcli.scene.points import GeometryFileError
+from mpmcli.scene.shapes import Ball, Shape, distance_grid
 
 R = 0.4
 
@@ -204,7 +204,7 @@ def test_a_file_that_makes_no_closed_surface_is_named(tmp_path: Path, name: str)
     """One sentence each, with the file in it."""
     made, said = BAD[name]
     path = saved(tmp_path, made(), "bad.vtp")
-    with pytest.raises(MeshFileError, match=said.replace("[", r"\[")):
+    with pytest.raises(GeometryFileError, match=said.replace("[", r"\[")):
         read_mesh(path)
     with pytest.raises(InputError, match=r"bodies\[0\].shape.mesh.file: .*bad.vtp: " + said.replace("[", r"\[")):
         scene_of({"mesh": {"file": path}})
@@ -226,7 +226,7 @@ def test_a_damaged_file_is_one_sentence_and_nothing_else(
 ) -> None:
     """VTK writes to the terminal what it thinks of it, unless it is kept from it."""
     (tmp_path / name).write_bytes(content)
-    with pytest.raises(MeshFileError, match=r"it is no mesh that can be read|it holds no triangle"):
+    with pytest.raises(GeometryFileError, match=r"it is no mesh that can be read|it holds no triangle"):
         read_mesh(tmp_path / name)
     assert capfd.readouterr() == ("", "")
 

@@ -6,8 +6,8 @@ import pytest
 from good_scene import GOOD, refusal
 
 from mpmcli.materials.registry import parameter_models
-from mpmcli.scene import ParticleField
 from mpmcli.scene.problem import listed, quoted
+from mpmcli.scene.schema import ParticleField
 
 LAW_NAMES = quoted(sorted(str(model.model_fields["law"].default) for model in parameter_models()))
 FIELD_NAMES = quoted(

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 from scipy.spatial import KDTree
 
-from mpmcli.scene import Ball, Box, Capsule, Cylinder, Polygon
+from mpmcli.scene.shapes import Ball, Box, Capsule, Cylinder, Polygon
 
 
 def make(model, dimension, **values):

@@ -13,7 +13,7 @@ from single_precision_run import in_single_precision
 from test_batch import batch_of, outputs_of, scene_named
 
 from mpmcli.errors import InputError
-from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.run import build_run
 
 ROOT = Path(__file__).resolve().parent.parent
 

@@ -9,8 +9,7 @@ from scenes import restart
 from solver_state import BodyState, bodies_of, scene_of
 
 from mpmcli.scene import BodyParticles, Scene, sample_bodies
-from mpmcli.solver.engine.build import build_run
-from mpmcli.solver.engine.run import Run
+from mpmcli.solver.engine.run import Run, build_run
 
 STEPS = 10_000
 # The block turns by some radians; the drop, which nothing holds together but its pressure, stays one drop.

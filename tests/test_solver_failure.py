@@ -7,8 +7,7 @@ import pytest
 from solver_state import scene_of
 
 from mpmcli.scene import Scene, sample_bodies
-from mpmcli.solver.engine.build import build_run
-from mpmcli.solver.engine.run import Run
+from mpmcli.solver.engine.run import Run, build_run
 from mpmcli.solver.engine.saved_state import SavedState
 from mpmcli.solver.frames.diagnosis import UnstableRunError
 from mpmcli.solver.machine.backend import Backend

@@ -11,11 +11,10 @@ from solver_state import bodies_of, scene_of
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.scene import Scene, sample_bodies
-from mpmcli.solver.engine.build import build_run
-from mpmcli.solver.engine.run import Run
+from mpmcli.solver.engine.run import Run, build_run
+from mpmcli.solver.frames.builder import ledger_sums, sums_of_rows
 from mpmcli.solver.frames.columns import FrameArrays, FrameColumns, RunConstants
 from mpmcli.solver.frames.diagnosis import read_group
-from mpmcli.solver.frames.ledger_sums import ledger_sums, sums_of_rows
 
 H = 0.1
 FIELDS = [
@@ -340,7 +339,7 @@ def test_a_forced_step_is_taken_above_the_stable_one(backend_of: Callable) -> No
 
 def test_a_run_can_be_stopped_between_two_frames(backend_of: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
     """A frame may take hours: an interrupt does not wait for it, only for the launch, the first of which is a step."""
-    monkeypatch.setattr("mpmcli.solver.engine.exchange.FIRST", 1)
+    monkeypatch.setattr("mpmcli.solver.engine.run.FIRST", 1)
     run, asked = build_run(scene_of(**falling(frames=1)), backend_of("f64")), []
 
     def at_the_second_launch() -> bool:

@@ -13,7 +13,7 @@ from scenes import block, scene
 
 from mpmcli.errors import InputError
 from mpmcli.materials.registry import laws
-from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.run import build_run
 
 RUN = Path(state_run.__file__)
 

@@ -13,7 +13,7 @@ from conftest import GPU
 from scenes import block, restart, scene
 
 from mpmcli.scene import sample_bodies
-from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.run import build_run
 from mpmcli.solver.frames.diagnosis import read_group
 from mpmcli.stability.limits import COURANT
 

@@ -16,10 +16,10 @@ from mpmcli.errors import InputError
 from mpmcli.frames.frame import Frame
 from mpmcli.scene import Scene, sample_bodies
 from mpmcli.solver.engine import batch
-from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.run import build_run
 from mpmcli.solver.grid.sparse_grid import first_nodes_of, reach_along, tiles_reached, wants_sparse
 from mpmcli.solver.machine.backend import Backend
-from mpmcli.solver.machine.plan import make_plan, require_room
+from mpmcli.solver.machine.plan import make_plan, require_memory
 from mpmcli.solver.transfer.splines import PAD
 from mpmcli.stability.transfer_factors import INTERVAL
 
@@ -192,7 +192,7 @@ def test_memory_is_that_of_what_is_occupied() -> None:
     ]
     assert plans[0].particles == pytest.approx(1e6, rel=0.02)
     assert plans[0].machine_bytes < 0.7 * 2**30
-    require_room(plans[0])
+    require_memory(plans[0])
     # Momentum and mass, and 8 fine nodes for each node.
     assert plans[0].bytes_per_node == 4 * (4 + 8)
     assert plans[1].device_bytes > 17e9

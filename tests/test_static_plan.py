@@ -9,8 +9,7 @@ from solver_state import scene_of
 from taichi.lang import impl, kernel_impl
 
 from mpmcli.scene import Scene
-from mpmcli.solver.engine.build import build_run
-from mpmcli.solver.engine.run import Run
+from mpmcli.solver.engine.run import Run, build_run
 from mpmcli.solver.machine.plan import make_plan
 
 WATER = {"law": "fluid", "density": 1000.0, "bulk_modulus": 1e5}
@@ -26,7 +25,7 @@ MODULES = {
     "bodies that separate": {"solver.contact.body_contact", "solver.contact.surfaces"},
     # Not asked for by the scene with features either.
     "grids of distances": {"boundaries.distances.GridDistance"},
-    "means of volume": {"solver.transfer.volume_average"},
+    "means of volume": {f"solver.transfer.volume.{name}" for name in ("cell_of", "average_range", "average_for_frame")},
 }
 
 

@@ -7,11 +7,9 @@ import pytest
 from scenes import block, scene
 from solver_state import bodies_of, scene_of
 
-from mpmcli.solver.engine.build import build_run
-from mpmcli.solver.engine.run import Run
-from mpmcli.solver.engine.run_numbers import HELD, Layout, Row
-from mpmcli.solver.engine.step_control import HOLD, RISE, HeldBound
-from mpmcli.solver.engine.step_size import StepSize
+from mpmcli.solver.engine.run import Run, build_run
+from mpmcli.solver.engine.run_state import Layout, RunState
+from mpmcli.solver.engine.step_size import HOLD, RISE, StepSize
 from mpmcli.solver.transfer.splines import SPLINES, TransferScheme
 
 # So soft that nothing but gravity moves it.
@@ -40,12 +38,12 @@ def test_a_step_that_falls_tenfold_drops_no_impulse(backend_of: Callable) -> Non
 
     for dt in [1e-3] * 5 + [1e-4] * 25 + [1e-3] * 2 + [1e-4] * 5:
         step(dt)
-    assert run.state.owed > 0, "the second fall has not left anything"
+    assert run.state.kick_carry > 0, "the second fall has not left anything"
     for _ in range(25):
         step(1e-4)
     body = bodies_of(run)["cloud"]
     expected = np.array(GRAVITY) * (run.time - 0.5e-4)
-    assert run.state.owed == 0.0
+    assert run.state.kick_carry == 0.0
     np.testing.assert_allclose(body.v, np.broadcast_to(expected, body.v.shape), rtol=1e-12)
     safety = run.scene.time.safety
     assert max(kicks) == pytest.approx(1 / safety)
@@ -56,12 +54,12 @@ def test_what_a_step_owes_is_saved(backend_of: Callable) -> None:
     run = falling(backend_of("f64"))
     for dt in (1e-3, 1e-3, 1e-4):
         run.step(dt)
-    owed, saved = run.state.owed, run.save().copied()
+    owed, saved = run.state.kick_carry, run.save().copied()
     assert owed == pytest.approx(0.55e-3 - 0.125e-3)
     run.step(1e-4)
     first = bodies_of(run)["cloud"].v
     run.load(saved)
-    assert run.state.owed == owed
+    assert run.state.kick_carry == owed
     run.step(1e-4)
     np.testing.assert_array_equal(bodies_of(run)["cloud"].v, first)
 
@@ -69,22 +67,21 @@ def test_what_a_step_owes_is_saved(backend_of: Callable) -> None:
 def test_a_bound_rises_late_and_never_with_an_oscillation() -> None:
     """It falls at once, stays through an oscillation, and rises within two series after its cause ended."""
     layout = Layout(2, [0])
-    numbers = np.zeros((1, layout.reals))
-    row = Row(layout, numbers[0], np.zeros(layout.counts, np.int32))
-    row.set(**dict(zip(HELD, HeldBound(), strict=True)), hold=HOLD, rise=RISE, infinity=np.inf)
+    run = RunState(layout, np.zeros((1, layout.widths["numbers"])), np.zeros((1, layout.widths["counts"]), np.int32), 0)
+    run.reset()
     step_size = StepSize(layout, [], None, TransferScheme(SPLINES["quadratic"]), drifts=True)
 
     def after(bound: float) -> float:
         """Return the bound that is held after a step whose own bound was this one."""
-        step_size.hold(0, bound, numbers)
-        return row.number("held")
+        step_size.limit_rise(run, bound)
+        return run.held
 
     seen = [after(1.0 + 0.2 * np.cos(angle)) for angle in 1.9 * np.arange(20 * HOLD)]
     assert min(seen) >= 0.8
     assert np.ptp(seen[HOLD:]) < 1e-3
     for n in range(2 * HOLD):
         assert after(2.0) == seen[-1] or n >= HOLD
-    assert row.number("held") == 2.0
+    assert run.held == 2.0
     for _ in range(3 * HOLD):
         assert after(2.0 * RISE * 0.99) == 2.0
     assert after(1.0) == 1.0

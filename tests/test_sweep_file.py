@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from good_sweep import BARE, BASE, LAWS, SWEEP, refusal, sweep_of, varied
 
-from mpmcli.dataset.sweep import Choice, Constant, Grid, Normal, Uniform
+from mpmcli.dataset.sweep import Choice, Grid, Normal, Uniform
 from mpmcli.dataset.sweep_file import load_sweep
 from mpmcli.errors import InputError
 
@@ -61,7 +61,7 @@ def test_kinds_of_values():
         )
     )
     assert list(sweep.vary.values()) == [
-        Constant(0.2),
+        Choice((0.2,)),
         Grid(([0.0, 0.0], [1.0, 0.0])),
         Normal(((-9.0, 1.0, -12.0, -6.0),), False),
         Normal(((0.0, 1.0, -1.0, 0.5),), False),

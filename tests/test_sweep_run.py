@@ -25,18 +25,17 @@ from tiny_sweep import BASE, contents, small_shards, tiny_sweep, told, write_swe
 from mpmcli.dataset import open as open_dataset
 from mpmcli.dataset.compute import Task, _with_step, compute
 from mpmcli.dataset.draw import draw
-from mpmcli.dataset.folder import Manifest
+from mpmcli.dataset.folder import Manifest, source_files, standing_alone
 from mpmcli.dataset.merge import merge
 from mpmcli.dataset.report import status_of, verify
-from mpmcli.dataset.sources import source_files, standing_alone
 from mpmcli.dataset.sweep import Sweep
 from mpmcli.dataset.sweep_file import load_sweep
 from mpmcli.dataset.sweep_run import SweepSettings, SweepState, _tasks, discard_beginning, run_sweep, taken_folder
 from mpmcli.errors import InputError
 from mpmcli.materials.registry import parameter_models
 from mpmcli.output import open_result
-from mpmcli.scene import Time
-from mpmcli.simulation.recording import Recording, record
+from mpmcli.scene.schema import Time
+from mpmcli.simulation.runner import Recording, record
 
 # A law that is stable by its own word, and in truth is not: its pressure pulls.
 WRONG_LAW = LAW.replace("spherical = constants[0]", "spherical = -constants[0]")

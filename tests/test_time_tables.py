@@ -10,7 +10,7 @@ from scipy.integrate import quad
 from mpmcli.scene.expression import Tree, evaluate
 from mpmcli.scene.expression_reader import parse
 from mpmcli.scene.quadrature import BOUND, HALF, MIDDLE, Mean
-from mpmcli.solver.drive.expressions import ROOM, TimeTables, thinned
+from mpmcli.solver.drive.expressions import ROOM, TimeTables, subsampled
 
 END, PAUSE = 2.0, 0.02
 # The last one has more parts in a window than a table has rows for it where all windows must find room.
@@ -74,9 +74,9 @@ def test_all_windows_find_room(backend_of: Callable) -> None:
 def test_joined_rows_keep_the_integral() -> None:
     """Rows that are joined hold the integral at their ends, and the largest bound of what they join."""
     rows = Mean(LAST, PAUSE, END).rows(3)
-    few = thinned(rows, 16)
+    few = subsampled(rows, 16)
     assert len(rows) > 100 and len(few) <= 16
-    assert thinned(rows, len(rows)) is rows
+    assert subsampled(rows, len(rows)) is rows
     for row in few:
         own = (rows[:, MIDDLE] > row[MIDDLE] - row[HALF]) & (rows[:, MIDDLE] < row[MIDDLE] + row[HALF])
         last = rows[own][-1]

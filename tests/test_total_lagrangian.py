@@ -15,7 +15,7 @@ from mpmcli.errors import InputError
 from mpmcli.materials.law import StateBound
 from mpmcli.materials.registry import laws
 from mpmcli.scene import sample_bodies
-from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.run import build_run
 from mpmcli.solver.machine.backend import Backend
 
 

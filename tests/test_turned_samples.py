@@ -9,7 +9,7 @@ import pytest
 from mpmcli.errors import InputError
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import checks, estimate_particles, parse_scene, sample_bodies
-from mpmcli.scene.turned import turned_axes, turned_points
+from mpmcli.scene.sampling import turned_axes, turned_points
 
 H = 0.02
 # Cells of a box of water, which stands in the corner of a domain that is larger along x and upwards.

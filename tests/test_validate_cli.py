@@ -163,7 +163,7 @@ CASE_FILE = '''\
 import numpy as np
 
 from mpmcli.validation.case import Case, Measure
-from mpmcli.validation.tables import body, box, elastic, problem
+from mpmcli.validation.shared import body, box, elastic, problem
 
 
 class Drift(Case):

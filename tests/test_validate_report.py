@@ -13,8 +13,7 @@ from invented_case import CASE, SINGLE, results, second_order
 
 from mpmcli.bench.report import describe_machine
 from mpmcli.validation.case import KNOBS, Measure, Setting
-from mpmcli.validation.figures import COURANT, LOOKS, draw_case
-from mpmcli.validation.report import Report, write_report
+from mpmcli.validation.report import COURANT, LOOKS, Report, draw_case, write_report
 from mpmcli.validation.runs import Run, RunResult, variants
 
 LOST = [Run("invented", n, Setting(transfer="aflip")) for n in (8, 16, 32)] + [

@@ -19,8 +19,7 @@ from mpmcli.solver.machine.backend import Backend
 from mpmcli.validation import runs as runs_module
 from mpmcli.validation.case import Measure, Setting
 from mpmcli.validation.cases import all_cases
-from mpmcli.validation.runs import Run, RunResult, carry_out, runs_of
-from mpmcli.validation.study import Journal, carry_out_all, run_key
+from mpmcli.validation.runs import Journal, Run, RunResult, carry_out, carry_out_all, run_key, runs_of
 
 RUNS = runs_of(CASE, "coarse")
 BAR = all_cases()["bar_fixed_free"]
@@ -139,7 +138,7 @@ def test_the_key_tells_scenes_settings_and_programs_apart(monkeypatch: pytest.Mo
     monkeypatch.setattr("mpmcli.validation.cases.bar.SPEED", 0.02)
     keys.add(run_key(BAR_RUN))
     monkeypatch.undo()
-    monkeypatch.setattr("mpmcli.validation.study._program", lambda: ("changed",))
+    monkeypatch.setattr("mpmcli.validation.runs._program", lambda: ("changed",))
     keys.add(run_key(BAR_RUN))
     assert len(keys) == 5
 

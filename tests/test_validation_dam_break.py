@@ -16,7 +16,6 @@ def test_the_data_are_three_fronts_and_a_height() -> None:
         assert len(series.T) == len(series.value)
         assert (np.diff(series.T) > 0).all()
         assert (np.sign(np.diff(series.value)) == (1 if series.quantity == "front" else -1)).all()
-        assert "Martin and Moyce 1952" in series.source
 
 
 def test_the_series_of_the_larger_column_agree() -> None:

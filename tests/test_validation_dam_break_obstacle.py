@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from mpmcli.validation.cases.dam_break_obstacle import (
+from mpmcli.validation.cases.dam_break import (
     DAM,
     DEPTH,
     FACE,
@@ -15,14 +15,14 @@ from mpmcli.validation.cases.dam_break_obstacle import (
     WET,
     arrival,
     impact,
-    measured,
+    measured_gauges,
     water_height,
 )
 
 
 def test_the_data_are_four_gauges_of_one_flow() -> None:
     """They stand in a row, and get wet from the column on, no sooner than by the fastest front there is."""
-    gauges = measured()
+    gauges = measured_gauges()
     assert list(gauges) == ["H1", "H2", "H3", "H4"]
     assert [gauge.x for gauge in gauges.values()] == [0.496, 0.992, 1.488, 2.638]
     for gauge in gauges.values():
@@ -68,7 +68,7 @@ def test_the_front_meets_the_box_on_its_way() -> None:
 
 
 def test_the_error_is_a_share_of_the_mean_height() -> None:
-    for gauge in measured().values():
+    for gauge in measured_gauges().values():
         assert gauge.mean_error(gauge.time, gauge.height, 1.1) == 0.0
         assert gauge.mean_error(gauge.time, 1.1 * gauge.height, 1.1) == pytest.approx(0.1, rel=1e-12)
         assert gauge.mean_error(gauge.time, gauge.height, gauge.arrival + 0.1) == 0.0

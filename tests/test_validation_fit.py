@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mpmcli.validation.measuring import fit_oscillation
+from mpmcli.validation.shared import fit_oscillation
 
 
 @given(

@@ -7,8 +7,10 @@ import pytest
 
 from mpmcli.scene.expression_reader import parse
 from mpmcli.validation.cases.mms import AXES, CASES, ManufacturedWave, StandingWave
+from mpmcli.validation.shared import lame_moduli
 
-CASE = pytest.mark.parametrize("case", CASES, ids=[case.name for case in CASES])
+WAVES = [case for case in CASES if isinstance(case, ManufacturedWave)]
+CASE = pytest.mark.parametrize("case", WAVES, ids=[case.name for case in WAVES])
 STEP = 1e-4
 
 
@@ -44,7 +46,7 @@ def test_force_balances_stress(case: ManufacturedWave, phase: float) -> None:
     acceleration = (16 * (u[1] + u[3]) - u[0] - u[4] - 30 * u[2]) / (12 * dt**2)
     for i, text in enumerate(wave.force()):
         divergence = slope(lambda place, i=i: wave.piola_stress(place, time)[:, i], X, i)
-        force = acceleration[:, i] - divergence / wave.density
+        force = acceleration[:, i] - divergence
         # Differences of an acceleration of c^2 pi^2 A lose eight digits to round-off.
         scale = wave.amplitude * wave.frequency**2
         assert np.abs(evaluated(text, X, time) - force).max() < 1e-5 * scale
@@ -70,7 +72,7 @@ def test_stretch_and_start_are_those_of_the_motion(case: ManufacturedWave) -> No
 def test_stress_is_the_derivative_of_the_energy(case: ManufacturedWave) -> None:
     """P_i = dW/dF_i of the stored energy of the law (Bonet and Wood 2008, eq. 6.27; Stomakhin et al. 2012)."""
     wave = case.wave
-    mu, lam = wave.moduli
+    mu, lam = lame_moduli(wave.young, wave.poisson)
 
     def energy(F: np.ndarray) -> np.ndarray:
         J = F.prod(axis=1)

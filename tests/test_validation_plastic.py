@@ -8,7 +8,7 @@ import pytest
 
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import parse_scene
-from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.run import build_run
 from mpmcli.validation.case import Setting
 from mpmcli.validation.cases import all_cases
 from mpmcli.validation.cases import plastic_blocks as paths

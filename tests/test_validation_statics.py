@@ -9,8 +9,8 @@ from mpmcli.scene.entry import value_of
 from mpmcli.scene.expression_reader import parse
 from mpmcli.validation.cases import column_dynamic, column_static, spinning_disc
 from mpmcli.validation.cases.cantilever import Beam
-from mpmcli.validation.measuring import window_weights
-from mpmcli.validation.tables import smooth_ramp
+from mpmcli.validation.cases.locking import CORNERS, DEFLECTION, LAME, PULL, SHEAR, STRIP
+from mpmcli.validation.shared import smooth_ramp, window_weights
 
 # P L^2 / EI, shortening / L, deflection / L, angle of the tip in degrees (docs/theory.md, 10).
 ELASTICA = [
@@ -29,6 +29,11 @@ SETTLED = [
     ("neo_hookean", 1e5, 41.30303152),
     ("fixed_corotated", 1e5, 40.0),
 ]
+# Elements along the membrane, the part that is pulled not included, and across.
+ELEMENTS = 18, 10
+# Points and weights of Gauss on [-1, 1].
+THREE = ((-(0.6**0.5), 5 / 9), (0.0, 8 / 9), (0.6**0.5, 5 / 9))
+TWO = ((-(3**-0.5), 1.0), (3**-0.5, 1.0))
 
 
 @pytest.mark.parametrize(("load", "shortening", "deflection", "degrees"), ELASTICA)
@@ -111,3 +116,65 @@ def test_disc_starts_in_balance() -> None:
     assert np.abs(rest).max() < 1e-6 * pull.max()
     assert abs(radial[-1]) < 1e-9 * radial[0]
     assert around[-1] == pytest.approx(8.125e-4)
+
+
+def shapes(s: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the quadratic shape functions of a line, and their slopes, at s in [-1, 1]."""
+    return np.array([s * (s - 1) / 2, 1 - s * s, s * (s + 1) / 2]), np.array([s - 0.5, -2 * s, s + 0.5])
+
+
+def deflection_of_the_membrane() -> float:
+    """Return the displacement along y of the middle of the right side of Cook's membrane, m.
+
+    Biquadratic elements in plane strain, with the volume integrated by 2 x 2 points where the shape takes 3 x 3, so
+    that they do not lock (Hughes 2000, chapter 4). Elements get narrower towards the clamped side and the faces, in
+    whose corners the stress is singular, and end where the pull begins.
+    """
+    (x0, low0), (x1, low1), (_, high1), (_, high0) = CORNERS
+    start = x1 - STRIP
+    along, across = ELEMENTS
+    # Nodes along x, those at the middle of elements included, and across, in parts of the width.
+    inner = np.linspace(0, 1, along + 1) ** 1.5
+    ends = x0 + (start - x0) * inner
+    ends = np.concatenate([ends, np.linspace(start, x1, 3)[1:]])
+    x = np.sort(np.concatenate([ends, (ends[1:] + ends[:-1]) / 2]))
+    ends = (1 - np.cos(np.pi * np.linspace(0, 1, across + 1))) / 2
+    t = np.sort(np.concatenate([ends, (ends[1:] + ends[:-1]) / 2]))
+    share = ((x - x0) / (x1 - x0))[:, None]
+    low, high = low0 + share * (low1 - low0), high0 + share * (high1 - high0)
+    nodes = np.stack(np.broadcast_arrays(x[:, None], low + (high - low) * t), axis=-1)
+    numbers = np.arange(len(x) * len(t)).reshape(len(x), len(t))
+    K, f = np.zeros((2 * numbers.size,) * 2), np.zeros(2 * numbers.size)
+    shape = np.diag([2 * SHEAR, 2 * SHEAR, SHEAR])
+    for i in range(0, len(x) - 1, 2):
+        for j in range(0, len(t) - 1, 2):
+            mine, points = numbers[i : i + 3, j : j + 3].ravel(), nodes[i : i + 3, j : j + 3].reshape(-1, 2)
+            k = np.zeros((18, 18))
+            for rule in (THREE, TWO):
+                for s, ws in rule:
+                    for r, wr in rule:
+                        (a, da), (b, db) = shapes(s), shapes(r)
+                        slopes = np.stack([np.outer(da, b).ravel(), np.outer(a, db).ravel()])
+                        jacobian = slopes @ points
+                        weight = ws * wr * np.linalg.det(jacobian)
+                        slopes = np.linalg.solve(jacobian, slopes)
+                        if rule is TWO:
+                            volume = slopes.T.ravel()
+                            k += LAME * weight * np.outer(volume, volume)
+                            continue
+                        B = np.zeros((3, 18))
+                        B[0, 0::2], B[1, 1::2], B[2, 0::2], B[2, 1::2] = slopes[0], slopes[1], slopes[1], slopes[0]
+                        k += weight * B.T @ shape @ B
+                        if x[i] >= start - 1e-9 * x1:
+                            f[2 * mine + 1] += PULL * weight * np.outer(a, b).ravel()
+            unknowns = np.stack([2 * mine, 2 * mine + 1], axis=1).ravel()
+            K[np.ix_(unknowns, unknowns)] += k
+    free = np.arange(2 * len(t), 2 * numbers.size)
+    u = np.linalg.solve(K[np.ix_(free, free)], f[free])
+    # At the middle of the width of the right side, where there is a node.
+    return float(u[2 * numbers[-1, len(t) // 2] + 1 - 2 * len(t)])
+
+
+def test_cooks_membrane_is_that_of_elements_that_do_not_lock() -> None:
+    """The matrix is ill-conditioned: the number of threads of LAPACK shows in the tenth digit."""
+    assert pytest.approx(DEFLECTION, rel=1e-8) == deflection_of_the_membrane()

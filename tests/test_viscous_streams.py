@@ -7,7 +7,7 @@ import pytest
 from solver_state import scene_of
 
 from mpmcli.scene import Scene
-from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.run import build_run
 from mpmcli.solver.machine.backend import Backend
 
 HONEY = {"law": "fluid", "density": 1400.0, "bulk_modulus": "auto", "viscosity": 10.0}

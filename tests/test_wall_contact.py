@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from contact_scenes import DENSITY, E, G, H, body, jelly, scene
 
-from mpmcli.check.result_ledger import CONTACT_SUSPECT, energy_change
+from mpmcli.check.result_check import CONTACT_SUSPECT, energy_change
 from mpmcli.frames.frame import Frame
 from mpmcli.scene import Scene
 from mpmcli.solver.contact.surfaces import BELOW_ALL
-from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.run import build_run
 
 C = math.sqrt(E / DENSITY)
 STIFF = jelly(youngs_modulus=4e6)

@@ -7,7 +7,7 @@ import pytest
 from solver_state import BodyState, bodies_of, scene_of
 
 from mpmcli.scene import BodyParticles, Scene
-from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.run import build_run
 
 G, DENSITY = 10.0, 1000.0
 # Of the block: its length and height, m.

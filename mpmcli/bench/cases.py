@@ -17,7 +17,7 @@ EDGE = 0.4
 
 @dataclass(frozen=True)
 class BenchCase:
-    """One size for all contestants: cells along an edge, a power of two for mpm3d, particles, and time step, s."""
+    """One size for all workers: cells along an edge, a power of two for mpm3d, particles, and time step, s."""
 
     dimension: int
     cells: int

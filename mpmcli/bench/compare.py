@@ -2,21 +2,21 @@
 
 import statistics
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from functools import partial
 
 from mpmcli.bench.cases import BenchCase
-from mpmcli.bench.contestant import Side, run_block
 from mpmcli.bench.ours import block_of_ours
 from mpmcli.bench.peers import Peer, Yardstick, has_compiler
 from mpmcli.bench.report import describe_machine, page
+from mpmcli.bench.worker import Side, run_block
 from mpmcli.errors import RunError
 from mpmcli.plain_text import counted, text_table
 
 # Duration of the first block, s, which is not measured: the remaining kernels compile.
 WARM_UP = 0.3
 IN_C = "C"
-NOTES = (
+FRAME_NUMBERS = (
     "M steps/s: million particle-steps per second, median of the blocks; on one thread by processor time.",
     "threads: of mpmcli, which takes one for each 2,500 particles, and of the peer. C: the yardstick.",
     "ratio: to the peer, with its range over neighbouring blocks; slower: than C. start, compile: mpmcli, s.",
@@ -33,8 +33,7 @@ def run_bench(
 ) -> dict:
     """Measure every case on each number of threads, all sides in turn (A B C A B C), and return the record.
 
-    Raises:
-        RunError: a side cannot run, or has other particles.
+    RunError: a side cannot run, or has other particles.
     """
     rows = []
     for case in cases:
@@ -50,7 +49,9 @@ def _run_case(case: BenchCase, threads: int, arch: str, seconds: float, blocks: 
         makes[IN_C] = partial(Yardstick, case, threads)
     by_processor = threads == 1 and arch == "cpu"
     with ExitStack() as stack:
-        sides = [stack.enter_context(Side(name, make, by_processor=by_processor)) for name, make in makes.items()]
+        sides = [
+            stack.enter_context(closing(Side(name, make, by_processor=by_processor))) for name, make in makes.items()
+        ]
         for side in sides:
             if side.particles != case.particles:
                 raise RunError(f"{side.name} runs {side.particles} particles instead of {case.particles}.")
@@ -73,7 +74,7 @@ def _run_case(case: BenchCase, threads: int, arch: str, seconds: float, blocks: 
 
 def bench_table(record: dict) -> str:
     """Return the record as text: one line per case and number of threads, then what the columns mean."""
-    rows, notes = [], list(NOTES)
+    rows, notes = [], list(FRAME_NUMBERS)
     for case in record["cases"]:
         sides = case["sides"]
         ours, peer, in_c = sides["mpmcli"], sides[case["peer"]], sides.get(IN_C)

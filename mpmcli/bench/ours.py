@@ -1,4 +1,4 @@
-"""The contestants of mpmcli: the falling block, and the column of a law."""
+"""The workers of mpmcli: the falling block, and the column of a law."""
 
 from collections import Counter
 from dataclasses import replace
@@ -96,7 +96,7 @@ class Ours:
         from mpmcli.solver.engine.compiled_kind import CompiledKind
         from mpmcli.solver.engine.run import Run
         from mpmcli.solver.machine.backend import choose_backend, start
-        from mpmcli.solver.machine.costs import useful_threads
+        from mpmcli.solver.machine.plan import useful_threads
 
         scene = parse_scene(data, laws=parameter_models(), source=data["title"]).scene
         backend = choose_backend(arch, threads, scene.solver.precision, compile_cache=False)
@@ -107,7 +107,7 @@ class Ours:
         bodies = particles or sample_bodies(scene)
         # Kernels of steps that bodies set themselves: those of a benchmark are short, and would keep motion.
         usual = scene.model_copy(update={"time": scene.time.model_copy(update={"step": "auto"})})
-        batch = Batch(CompiledKind.of(usual, bodies).roomy(), backend)
+        batch = Batch(CompiledKind.of(usual, bodies).padded(), backend)
         self.run = Run(batch, 0, scene, bodies, force=particles is not None)
         self.threads, self.particles = backend.threads, self.run.particle_count
         self.step = self._smallest = data["time"]["step"]

@@ -1,4 +1,4 @@
-"""The other contestants: MPM examples of the taichi package, and the yardstick, the same block in C.
+"""The other workers: MPM examples of the taichi package, and the yardstick, the same block in C.
 
 Examples are read from the installed files. Only settings change: backend, threads, precision, grid, particles and step.
 The window at the end of each is left out. Every line that is changed must be found exactly once, so that another
@@ -103,8 +103,11 @@ class Peer:
 
     def __init__(self, case: BenchCase, threads: int, arch: str = "cpu", precision: str = "f32") -> None:
         path = example_path(case.peer)
-        text = path.read_text(encoding="utf-8")
-        module = _run_source(adapted_source(text, case, threads, arch, precision), f"<{path.name} of bench>")
+        source = adapted_source(path.read_text(encoding="utf-8"), case, threads, arch, precision)
+        module, filename = ModuleType("taichi_example"), f"<{path.name} of bench>"
+        # Taichi reads the source of a kernel again, through linecache.
+        linecache.cache[filename] = (len(source), None, source.splitlines(keepends=True), filename)
+        exec(compile(source, filename, "exec"), module.__dict__)
         example = EXAMPLES[case.peer]
         self.particles: int = module.n_particles
         self.threads = threads
@@ -136,14 +139,6 @@ class Peer:
         return bool(((position > 0) & (position < 1)).all())
 
 
-def _run_source(source: str, filename: str) -> ModuleType:
-    module = ModuleType("taichi_example")
-    # Taichi reads the source of a kernel again, through linecache.
-    linecache.cache[filename] = (len(source), None, source.splitlines(keepends=True), filename)
-    exec(compile(source, filename, "exec"), module.__dict__)
-    return module
-
-
 def has_compiler() -> bool:
     """Return whether gcc is on the PATH."""
     return shutil.which("gcc") is not None
@@ -166,7 +161,7 @@ def load_yardstick(dimension: int) -> ctypes.CDLL:
         except OSError as error:
             raise RunError(f"The yardstick in C cannot be loaded: {error}") from error
     whole, real, pointer = ctypes.c_int, ctypes.c_float, ctypes.c_void_p
-    arguments = {"advance": [whole], "read": [pointer, pointer], "seconds": [pointer], "free": []}
+    arguments = {"advance": [whole], "read": [pointer, pointer], "seconds": [pointer]}
     for name, others in arguments.items():
         getattr(loaded, f"yardstick_{name}").argtypes = [pointer, *others]
     loaded.yardstick_new.argtypes = [*[whole] * 4, *[real] * 6, pointer, pointer]
@@ -230,7 +225,3 @@ class Yardstick:
         """Whether every particle is in the box, or less than BEHIND cells behind a wall."""
         position, beyond = self.state()[0], BEHIND * self._spacing
         return bool(((position > -beyond) & (position < 1 + beyond)).all())
-
-    def close(self) -> None:
-        """Give the memory back."""
-        self._library.yardstick_free(self._handle)

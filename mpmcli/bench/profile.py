@@ -1,14 +1,16 @@
 """What the phases of a step take, for each law, and in C: sort, P2G, grid, G2P, volumes, and measuring the state."""
 
 import statistics
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
+from contextlib import closing
 from functools import partial
+from operator import methodcaller
 
 from mpmcli.bench.cases import EDGE, BenchCase
-from mpmcli.bench.contestant import Side, run_block
 from mpmcli.bench.ours import ProfiledColumn
 from mpmcli.bench.peers import Yardstick, has_compiler
 from mpmcli.bench.report import describe_machine, page
+from mpmcli.bench.worker import Side, run_block
 from mpmcli.materials.registry import laws
 from mpmcli.plain_text import text_table
 
@@ -20,7 +22,7 @@ COLUMNS = ("sort", "p2g", "grid", "g2p", "volumes", "measure", "rest", "total")
 # Start of the measured interval, s. The wave of the impact, at about 25 m/s, is then inside the column, which leans and
 # spreads; nothing is at rest.
 SETTLING = 0.05
-NOTES = (
+FRAME_NUMBERS = (
     "ns per particle and step, median of the blocks, wall time, of steps whose phases are launched one by one: the",
     "kernel of mpmcli simulate has the same functions without launches between them. P2G and G2P contain the law.",
     "grid: clearing, and the update of nodes; volumes: their relaxation, or average; measure: for the limits of",
@@ -29,48 +31,34 @@ NOTES = (
 
 
 def run_profile(
-    cases: Iterable[BenchCase],
-    threads: int,
-    seconds: float,
-    blocks: int,
-    tell: Callable[[str], None],
-    names: Sequence[str] | None = None,
+    cases: Iterable[BenchCase], threads: int, seconds: float, blocks: int, tell: Callable[[str], None]
 ) -> dict:
-    """Measure the phases of laws, all by default, and of the fluid in C, one after the other; return the record."""
+    """Measure the phases of all laws, and of the fluid in C, one after the other; return the record."""
     rows = []
     for case in cases:
-        makes = {
-            law: partial(ProfiledColumn, law, case, threads) for law in (sorted(laws()) if names is None else names)
-        }
+        makes = {law: partial(ProfiledColumn, law, case, threads) for law in sorted(laws())}
         if has_compiler():
             block = BenchCase(case.dimension, case.cells, round((2 * EDGE * case.cells) ** case.dimension), case.step)
             makes[IN_C] = partial(Yardstick, block, threads)
         for name, make in makes.items():
             tell(f"{case.name}: {name}")
-            with Side(name, make, by_processor=False) as side:
+            with closing(Side(name, make, by_processor=False)) as side:
                 if name != IN_C:
-                    side.ask(_advance, round(SETTLING / case.step))
+                    side.ask(methodcaller("advance", round(SETTLING / case.step)))
                 side.ask(run_block, 0.1)
                 rows.append({"case": case.name, "name": name, **_measured(side, seconds, blocks)})
     return {"machine": describe_machine(), "threads": threads, "block_s": seconds, "profile": rows}
 
 
-def _advance(contestant: ProfiledColumn, steps: int) -> None:
-    contestant.advance(steps)
-
-
-def _phases(contestant: ProfiledColumn | Yardstick) -> dict[str, float]:
-    return contestant.phases()
-
-
 def _measured(side: Side, seconds: float, blocks: int) -> dict:
     """Return the particles, and medians of the columns, ns per particle and step."""
-    side.ask(_phases)
+    phases = methodcaller("phases")
+    side.ask(phases)
     found: list[dict[str, float]] = []
     for _ in range(blocks):
         share = 1e9 / side.particles / side.measure(seconds)
         columns = dict.fromkeys(COLUMNS, 0.0)
-        for name, spent in side.ask(_phases).items():
+        for name, spent in side.ask(phases).items():
             if name != "frame":
                 columns[COLUMN_OF.get(name, "grid")] += share * spent
         columns["rest"] = side.blocks[-1] - sum(columns.values())
@@ -86,4 +74,4 @@ def profile_table(record: dict) -> str:
         for row in record["profile"]
     ]
     table = text_table(["case", "law", "particles", *COLUMNS], rows, left={0, 1})
-    return page(record["machine"], f"cpu, threads: {record['threads']}", table, NOTES)
+    return page(record["machine"], f"cpu, threads: {record['threads']}", table, FRAME_NUMBERS)

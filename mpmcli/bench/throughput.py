@@ -7,13 +7,14 @@ cells, 1,444 particles, and 350 frames of 2.5 ms.
 import statistics
 import tempfile
 from collections.abc import Callable
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 
 from mpmcli.bench.cases import CASES
-from mpmcli.bench.contestant import Side
 from mpmcli.bench.peers import Peer
 from mpmcli.bench.report import describe_machine, page
+from mpmcli.bench.worker import Side
 from mpmcli.dataset.sweep import Sweep
 from mpmcli.dataset.sweep_file import load_sweep
 from mpmcli.dataset.sweep_run import SweepSettings, SweepState, run_sweep
@@ -73,18 +74,18 @@ def run_throughput(
 ) -> dict:
     """Compute sweeps with one worker and with all in turn, mpm88 between, and return the record for JSON.
 
-    Args:
-        seconds: length of a block.
-
-    Raises:
-        RunError: the peer or a sweep failed.
+    A block takes so many seconds. RunError: the peer or a sweep failed.
     """
     found: dict[int, list[SweepState]] = {count: [] for count in sorted({1, workers})}
-    with Side("mpm88", partial(Peer, CASES[0], PEER_THREADS), by_processor=False) as peer:
+    with closing(Side("mpm88", partial(Peer, CASES[0], PEER_THREADS), by_processor=False)) as peer:
         peer.measure(0.3)
         peer.blocks.clear()
         tell(f"first block, not measured: {WARM_UP} trajectories")
-        share = max(1, round(seconds / _warm_up(frames)))
+        # Compiles what the sweep needs; the time of a trajectory is that after the first.
+        ends: list[tuple[int, float]] = []
+        _block(1, WARM_UP, frames, lambda state: ends.append((state.done, state.seconds)))
+        (first, begin), (last, end) = ends[0], ends[-1]
+        share = max(1, round(seconds / ((end - begin) / max(1, last - first))))
         for number in range(blocks):
             peer.measure(PEER_SECONDS)
             for count, states in found.items():
@@ -105,14 +106,6 @@ def _block(
     with tempfile.TemporaryDirectory() as folder:
         sweep = sand_sweep(Path(folder), count, frames)
         return run_sweep(sweep, SweepSettings(Path(folder) / "dataset", workers=workers, arch="cpu"), on_progress)
-
-
-def _warm_up(frames: int) -> float:
-    """Compile what the sweep needs, and return the time of a trajectory after the first, s."""
-    ends: list[tuple[int, float]] = []
-    _block(1, WARM_UP, frames, lambda state: ends.append((state.done, state.seconds)))
-    (first, begin), (last, end) = ends[0], ends[-1]
-    return (end - begin) / max(1, last - first)
 
 
 def _result(workers: int, states: list[SweepState], generator: float) -> dict:

@@ -143,7 +143,7 @@ class Colliders:
         """Allocate colliders on a grid with `shape` nodes per axis, whose node `first` is the lower corner."""
         d, n = dimension, runs * kind.count
         self.kind, self.dimension, self.shape, self.first, self.on_cpu = kind, d, tuple(shape), first, on_cpu
-        self.room, self.run, self.spacing = kind.count, 0, 0.0
+        self.capacity, self.run, self.spacing = kind.count, 0, 0.0
         self.layered, self.own = False, 0
         self.real = np.float64 if ti.lang.impl.current_cfg().default_fp == ti.f64 else np.float32
         self.loads = Loads(kind.count, shape, runs, on_cpu=on_cpu)
@@ -178,7 +178,7 @@ class Colliders:
         self.count[run] = len(scene.colliders)
         used, sampled = run * self.kind.numbers, run * self.kind.samples
         for k, collider in enumerate(scene.colliders):
-            i = run * self.room + k
+            i = run * self.capacity + k
             numbers = numbers_of(collider, h)
             self._write_numbers(used, np.array(numbers, self.real))
             if form_code(collider) == GRID:
@@ -212,18 +212,18 @@ class Colliders:
             self.samples[first + k] = values[k]
 
     @ti.func
-    def book_row(self, q: int):
+    def add_row(self, q: int):
         """Book what collider q % room has taken from the nodes of row q // room in a step, in their order."""
         d = ti.static(self.dimension)
         nodes = ti.static(self.shape[-1])
-        k, rest = q % self.room, q // self.room
+        k, rest = q % self.capacity, q // self.capacity
         first = rest * nodes
         x = ti.Vector.zero(float, d)
         for b in ti.static(range(d - 1)):
             a = ti.static(d - 2 - b)
             x[a] = ti.cast(rest % ti.static(self.shape[a]) - self.first, float) * self.spacing
             rest = rest // ti.static(self.shape[a])
-        i, nodes_before = self.run * self.room + k, self.run * ti.static(self.loads.rows) * nodes
+        i, nodes_before = self.run * self.capacity + k, self.run * ti.static(self.loads.rows) * nodes
         if k < self.count[self.run]:
             near = True
             for a in ti.static(range(d - 1)):
@@ -233,11 +233,11 @@ class Colliders:
                 total = ti.Vector.zero(float, ti.static(self.loads.width))
                 for n in range(nodes):
                     x[ti.static(d - 1)] = ti.cast(n - self.first, float) * self.spacing
-                    given = (nodes_before + first + n) * self.room + k
+                    given = (nodes_before + first + n) * self.capacity + k
                     total += self.loads.of(self.given[given], x - self.place[i])
                     for a in ti.static(range(d)):
                         self.given[given][a] = 0.0
-                row = self.run * self.loads.rows * self.room + q
+                row = self.run * self.loads.rows * self.capacity + q
                 self.loads.taken[row] = self.loads.taken[row] + total
 
     @ti.func
@@ -248,7 +248,7 @@ class Colliders:
         for a in ti.static(range(d)):
             result[a] = velocity[a]
         for k in range(self.count[self.run]):
-            i = self.run * self.room + k
+            i = self.run * self.capacity + k
             arm = x - self.place[i]
             near = self.covers(i, x)
             if ti.static(self.layered):
@@ -260,7 +260,7 @@ class Colliders:
                         after, _grip = self.met(i, arm, normal, result)
                         if ti.static(self.deterministic):
                             row = self.run * self.loads.rows + self.loads.row_of(node)
-                            place = (row * ti.static(self.shape[-1]) + node[d - 1]) * self.room + k
+                            place = (row * ti.static(self.shape[-1]) + node[d - 1]) * self.capacity + k
                             for a in ti.static(range(d)):
                                 self.given[place][a] = self.given[place][a] + mass * (result[a] - after[a])
                         else:
@@ -295,7 +295,7 @@ class Colliders:
         """Return the way, m, that a particle at x may go: at most half of that to the surface of a collider."""
         result = way
         for k in range(self.count[self.run]):
-            i = self.run * self.room + k
+            i = self.run * self.capacity + k
             if self.covers(i, x) and self.wall[i] != HOLD:
                 for face in range(self.faces_of(i)):
                     phi, normal = self.distance(i, x - self.place[i], face)
@@ -384,7 +384,7 @@ class ColliderMotion:
         self.rates = double_field(n, d + 1)
         # Where the pivot is, relative to the lower corner, m, and the angle, rad.
         self.pose = double_field(n, d + 1)
-        self.axis = double_field(n, width=3)
+        self.axis = double_field(n, entries=(3,))
 
     def write(self, scene: Scene, run: int = 0) -> None:
         """Set the motions of a run, at time 0."""
@@ -407,7 +407,7 @@ class ColliderMotion:
         d = ti.static(self.dimension)
         for m, k in ti.static(enumerate(self.moving)):
             row = run * ti.static(len(self.moving)) + m
-            i = run * self.colliders.room + k
+            i = run * self.colliders.capacity + k
             angle, change = self.pose[row, d], dt * self.rates[row, d]
             turned, turning = self.rotation(row, angle), self.rotation(row, change)
             for a in ti.static(range(d)):

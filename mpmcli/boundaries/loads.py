@@ -13,46 +13,46 @@ class Loads:
     """Impulses, N s, and angular impulses, N m s, since the last frame, of some takers in each run of a batch.
 
     Attributes:
-        room: takers of a run; rows: rows of nodes of a run, along the last axis.
+        capacity: takers of a run; rows: rows of nodes of a run, along the last axis.
         width: numbers of an impulse and an angular impulse, 3 in 2D, 6 in 3D.
         taken: of each taker, by rows of nodes: parts of a step share none, so that the sum has an order.
     """
 
-    def __init__(self, room: int, shape: Sequence[int], runs: int, *, on_cpu: bool) -> None:
-        self.dimension, self.shape, self.room, self.on_cpu = len(shape), tuple(shape), room, on_cpu
+    def __init__(self, capacity: int, shape: Sequence[int], runs: int, *, on_cpu: bool) -> None:
+        self.dimension, self.shape, self.capacity, self.on_cpu = len(shape), tuple(shape), capacity, on_cpu
         self.rows, self.width = math.prod(shape[:-1]), 3 if len(shape) == 2 else 6
-        self.taken = ti.Vector.field(self.width, ti.f64 if on_cpu else float, shape=runs * room * self.rows)
+        self.taken = ti.Vector.field(self.width, ti.f64 if on_cpu else float, shape=runs * capacity * self.rows)
 
     @staticmethod
-    def bytes_needed(room: int, dimension: int, rows: int) -> int:
+    def bytes_needed(capacity: int, dimension: int, rows: int) -> int:
         """Return the bytes that they take on a CPU."""
-        return 8 * room * rows * (3 if dimension == 2 else 6)
+        return 8 * capacity * rows * (3 if dimension == 2 else 6)
 
     @ti.kernel
     def clear(self, run: int):
         """Forget what a run has taken."""
-        for q in range(self.rows * self.room):
-            self.taken[run * self.rows * self.room + q] = ti.Vector.zero(float, self.width)
+        for q in range(self.rows * self.capacity):
+            self.taken[run * self.rows * self.capacity + q] = ti.Vector.zero(float, self.width)
 
     def read(self, run: int, count: int) -> np.ndarray:
         """Return what the first takers of a run have taken, (count, width), and forget it."""
-        size = self.rows * self.room
+        size = self.rows * self.capacity
         taken = self.taken.to_numpy()[run * size : (run + 1) * size].astype(np.float64)
         self.clear(run)
-        return np.cumsum(taken.reshape(self.rows, self.room, -1), axis=0)[-1][:count]
+        return np.cumsum(taken.reshape(self.rows, self.capacity, -1), axis=0)[-1][:count]
 
     @ti.func
-    def sum_up(self, run: int, frame: int, column: int, notes: ti.template()):
-        """Store what the takers of a run have taken in notes[run, frame], from a column on, and forget it."""
-        for k in range(self.room):
+    def sum_up(self, run: int, frame: int, column: int, frame_stats: ti.template()):
+        """Store what the takers of a run have taken in frame_stats[run, frame], from a column on, and forget it."""
+        for k in range(self.capacity):
             total = ti.Vector.zero(ti.f64, self.width)
             for row in range(self.rows):
-                place = (run * self.rows + row) * self.room + k
+                place = (run * self.rows + row) * self.capacity + k
                 for a in ti.static(range(self.width)):
                     total[a] += self.taken[place][a]
                     self.taken[place][a] = ti.cast(0, ti.f64)
             for a in ti.static(range(self.width)):
-                notes[run, frame, column + k * self.width + a] = total[a]
+                frame_stats[run, frame, column + k * self.width + a] = total[a]
 
     @ti.func
     def row_of(self, node: ti.template()):
@@ -65,7 +65,7 @@ class Loads:
     @ti.func
     def take(self, run: int, node: ti.template(), k: int, impulse: ti.template(), arm: ti.template()):
         """Book the impulse that taker k gets at a node, N s, at an arm from its point of reference, m."""
-        place = (run * self.rows + self.row_of(node)) * self.room + k
+        place = (run * self.rows + self.row_of(node)) * self.capacity + k
         load = self.of(impulse, arm)
         for a in ti.static(range(self.width)):
             if ti.static(self.on_cpu):

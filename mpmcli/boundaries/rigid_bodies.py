@@ -3,10 +3,13 @@
 Each body has one velocity U with which its momentum and what the nodes give it agree: M U = P + sum A^T J(U), where J
 are the impulses of `Colliders.met` and A maps U to the velocity at a node. Newton's method finds it in rounds, of which
 each adds up the nodes row by row and then the rows in their order. Whatever it finds, the body gets exactly what the
-nodes lose in the update.
+nodes lose in the update; on a GPU to single precision, as many nodes add to a row at once.
 """
 
+import numpy as np
+
 from mpmcli.boundaries.colliders import HELD, LOOSE, REACH, Colliders
+from mpmcli.boundaries.doubles import double_field
 from mpmcli.boundaries.rigid_motion import RigidMotion
 from mpmcli.quick_taichi import ti
 
@@ -27,23 +30,36 @@ class RigidBodies(RigidMotion):
         super().__init__(colliders, pushes, runs)
         n = runs * self.count
         self.entries = self.loads + self.loads * (self.loads + 1) // 2
-        self.sums = ti.field(ti.f64, shape=(n * colliders.loads.rows, self.entries))
-        self.total = ti.field(ti.f64, shape=(n, self.entries))
+        self.sums = double_field(n * colliders.loads.rows, self.entries)
+        self.total = double_field(n, self.entries)
 
     @ti.func
-    def sum_up(self, run: int, frame: int, column: int, notes: ti.template()):
-        """Store poses and rates in notes[run, frame], from a column on; add what bodies took to the loads before it."""
-        loads, room = ti.static((self.loads, self.colliders.room))
+    def sum_up(self, run: int, frame: int, column: int, frame_stats: ti.template()):
+        """Store poses and rates of a frame, from a column on; add what bodies took to the loads before it."""
+        loads, room = ti.static((self.loads, self.colliders.capacity))
         for j in range(self.count):
             b = run * self.count + j
             self.take_rate(b)
             own, taken = column + j * ti.static(self.width + loads), column + (self.numbers[j] - room) * loads
             for a in range(self.width):
-                notes[run, frame, own + a] = self.pose[b, a]
+                frame_stats[run, frame, own + a] = self.pose[b, a]
             for a in range(loads):
-                notes[run, frame, own + ti.static(self.width) + a] = self.rate[b, a]
-                notes[run, frame, taken + a] += self.booked[b, a]
+                frame_stats[run, frame, own + ti.static(self.width) + a] = self.rate[b, a]
+                frame_stats[run, frame, taken + a] += self.booked[b, a]
                 self.booked[b, a] = ti.cast(0, ti.f64)
+
+    def read(self, run: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return poses and rates of the bodies of a run, (count, k), and what they took since the last frame.
+
+        That is forgotten. On the CPU the kernel does so, see `sum_up`.
+        """
+        own = slice(run * self.count, (run + 1) * self.count)
+        momentum, mobility, booked = (one.to_numpy() for one in (self.momentum, self.mobility, self.booked))
+        rates = (mobility[own] @ momentum[own][..., None])[..., 0]
+        taken = booked[own].copy()
+        booked[own] = 0.0
+        self.booked.from_numpy(booked)
+        return np.hstack([self.pose.to_numpy()[own], rates]), taken
 
     # A round.
 
@@ -123,14 +139,15 @@ class RigidBodies(RigidMotion):
                         self.sums[row, e] = 0
                 self.set_inertia(b)
                 for a in range(n):
-                    self.system[b, a, n] = self.momentum[b, a] + self.support[b, a] + self.total[b, a]
+                    lacked = self.momentum[b, a] + self.support[b, a] + self.total[b, a]
                     for c in range(n):
-                        self.system[b, a, n] -= self.system[b, a, c] * self.rate[b, c]
+                        lacked -= self.system[b, a, c] * self.rate[b, c]
+                    self.system[b, a, n] = lacked
                 # The upper half of the matrix lies row by row behind the load.
                 e = n
                 for a in range(n):
                     for c in range(a, n):
-                        self.system[b, a, c] += self.total[b, e]
+                        self.system[b, a, c] = self.system[b, a, c] + self.total[b, e]
                         self.system[b, c, a] = self.system[b, a, c]
                         e += 1
                 self.improve(b, dt)
@@ -142,15 +159,16 @@ class RigidBodies(RigidMotion):
         n, ways = ti.static(self.loads), self.left[b]
         self.reduce(b)
         for k in range(ways):
-            self.reduced[b, k, ways] = 0
+            right = ti.cast(0, ti.f64)
             for a in range(n):
-                self.reduced[b, k, ways] += self.ways[b, a, k] * self.system[b, a, n]
+                right += self.ways[b, a, k] * self.system[b, a, n]
+            self.reduced[b, k, ways] = right
         # A motor's body has one way, and its system is a number.
         resisted, lacked = self.reduced[b, 0, 0], self.reduced[b, 0, ways]
         if self.strength[b] > 0:
             wanted = resisted * (self.motor[b] - self.rate_of(b)) - lacked
-            self.reduced[b, 0, 1] += self.clamped(b, dt, wanted)
-        right = self.reduced[b, 0, ways] - lacked
+            self.reduced[b, 0, 1] = self.reduced[b, 0, 1] + self.clamped(b, dt, wanted)
+        driven = self.reduced[b, 0, ways] - lacked
         self.eliminate(b, 1)
         gain, energy = ti.cast(0, ti.f64), ti.cast(0, ti.f64)
         for a in range(n):
@@ -160,8 +178,8 @@ class RigidBodies(RigidMotion):
             found = self.reduced[b, k, ways]
             for a in range(n):
                 gain += found * self.ways[b, a, k] * self.system[b, a, n]
-                self.rate[b, a] += self.ways[b, a, k] * found
-        gain += self.reduced[b, 0, ways] * right
+                self.rate[b, a] = self.rate[b, a] + self.ways[b, a, k] * found
+        gain += self.reduced[b, 0, ways] * driven
         if gain <= SETTLED * energy:
             self.settled[b] = 1
 
@@ -177,11 +195,11 @@ class RigidBodies(RigidMotion):
             for q in range(self.product(rows)):
                 row = (
                     run * self.colliders.loads.rows + self.row_at(low, rows, q)
-                ) * self.colliders.room + self.numbers[j]
+                ) * self.colliders.capacity + self.numbers[j]
                 for a in ti.static(range(self.loads)):
                     self.booked[b, a] = self.booked[b, a] + self.colliders.loads.taken[row][a]
                     self.momentum[b, a] = self.momentum[b, a] + self.colliders.loads.taken[row][a]
-                    self.colliders.loads.taken[row][a] = ti.cast(0, ti.f64)
+                    self.colliders.loads.taken[row][a] = 0.0
             self.take_rate(b)
             self.drive[b] = 0
             self.turn_motor(b, dt)

@@ -7,6 +7,7 @@ a part of that is undone.
 """
 
 from mpmcli.boundaries.colliders import HOLD, STICK, contact_points
+from mpmcli.boundaries.doubles import double_field
 from mpmcli.boundaries.rigid_bodies import RigidBodies
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
@@ -26,41 +27,41 @@ LATER = -1.0
 
 @ti.data_oriented
 class RigidContact:
-    """The contact of the bodies of some runs; `faces` are the words of the walls, `room` the points of a run."""
+    """The contact of the bodies of some runs; `faces` are the words of the walls, `capacity` the points of a run."""
 
     def __init__(self, bodies: RigidBodies, faces: tuple[tuple[str, str], ...], runs: int) -> None:
         d, self.bodies, self.dimension = bodies.dimension, bodies, bodies.dimension
-        self.room = bodies.colliders.kind.points
+        self.capacity = bodies.colliders.kind.points
         self.walls = tuple((a, side) for a in range(d) for side in (0, 1) if faces[a][side] != "open")
-        n = runs * self.room
+        n = runs * self.capacity
         self.used = ti.field(int, shape=runs)
         # Of each body the radius if it is a ball, m, else 0.
-        self.ball = ti.field(ti.f64, shape=runs * bodies.count)
+        self.ball = double_field(runs * bodies.count)
         # Of each point: its body, and where it is on it.
-        self.body, self.point = ti.field(int, shape=n), ti.Vector.field(d, ti.f64, shape=n)
+        self.body, self.point = ti.field(int, shape=n), double_field(n, entries=(d,))
         # How far it is from the centre of its body in this step.
-        self.arm = ti.Vector.field(d, ti.f64, shape=n)
+        self.arm = double_field(n, entries=(d,))
         # What it may meet in this step, the number of a collider or WALL, at a distance and with a normal.
         self.meets, self.other = ti.field(int, shape=n), ti.field(int, shape=n)
-        self.gap, self.friction = ti.field(ti.f64, shape=n), ti.field(ti.f64, shape=n)
-        self.normal, self.impulse = (ti.Vector.field(d, ti.f64, shape=n) for _ in range(2))
+        self.gap, self.friction = double_field(n), double_field(n)
+        self.normal, self.impulse = (double_field(n, entries=(d,)) for _ in range(2))
         # By which it parts from what it begins to touch, m/s, or LATER.
-        self.rebound = ti.field(ti.f64, shape=n)
+        self.rebound = double_field(n)
         # Of each collider the body that it is, or -1, and its coefficient of restitution; of each face its friction.
-        self.body_of = ti.field(int, shape=bodies.colliders.room)
+        self.body_of = ti.field(int, shape=bodies.colliders.capacity)
         self.body_of.fill(-1)
         for j, k in enumerate(bodies.free):
             self.body_of[k] = j
-        self.restitution = ti.field(float, shape=runs * bodies.colliders.room)
+        self.restitution = ti.field(float, shape=runs * bodies.colliders.capacity)
         self.face_friction = ti.field(float, shape=(runs, d, 2))
 
     def write(self, scene: Scene, run: int = 0) -> None:
         """Set the points of a run."""
         for k, collider in enumerate(scene.colliders):
-            self.restitution[run * self.bodies.colliders.room + k] = collider.restitution
+            self.restitution[run * self.bodies.colliders.capacity + k] = collider.restitution
         found = [contact_points(scene.colliders[k], scene.domain.spacing) for k in self.bodies.free]
         self.used[run] = sum(map(len, found))
-        q = run * self.room
+        q = run * self.capacity
         for j, points in enumerate(found):
             form = scene.colliders[self.bodies.free[j]].form
             self.ball[run * self.bodies.count + j] = form.radius if isinstance(form, Ball) else 0.0
@@ -75,7 +76,7 @@ class RigidContact:
     @ti.func
     def resolve(self, run: int, dt: ti.f64, extent: ti.template(), colliders: ti.template()):
         """Change the momenta of the bodies so that no point passes a surface in a step of dt seconds."""
-        first = run * self.room
+        first = run * self.capacity
         any_meets = False
         for q in range(first, first + self.used[run]):
             any_meets = self.look(run, q, dt, extent, colliders) or any_meets
@@ -111,11 +112,15 @@ class RigidContact:
         for k in range(tries):
             if k > 0 and other != NOTHING:
                 # Of a ball the point that faces what is near.
-                arm = -self.ball[b] * normal
-            gap, other, friction, normal = self.nearest(run, b, own, arm, extent, colliders)
+                for a in ti.static(range(d)):
+                    arm[a] = -self.ball[b] * normal[a]
+            gap, other, friction, found = self.nearest(run, b, own, arm, extent, colliders)
+            # Entry by entry: Taichi may lose vectors that are assigned as a whole.
+            for a in ti.static(range(d)):
+                normal[a] = found[a]
         for a in ti.static(range(d)):
             self.arm[q][a] = arm[a]
-        self.friction[q] = ti.cast(ti.max(friction, self.rub_of(colliders, run * colliders.room + own)), ti.f64)
+        self.friction[q] = ti.cast(ti.max(friction, self.rub_of(colliders, run * colliders.capacity + own)), ti.f64)
         pressed = ti.max(self.impulse[q].dot(normal), 0.0)
         if self.other[q] != other:
             pressed = ti.cast(0, ti.f64)
@@ -125,9 +130,9 @@ class RigidContact:
             self.normal[q][a], self.impulse[q][a] = normal[a], after[a]
         self.rebound[q] = 0
         if other != NOTHING and pressed == 0:
-            bounces = self.restitution[run * colliders.room + own]
+            bounces = self.restitution[run * colliders.capacity + own]
             if other >= 0:
-                bounces = ti.max(bounces, self.restitution[run * colliders.room + other])
+                bounces = ti.max(bounces, self.restitution[run * colliders.capacity + other])
             approach = -self.velocity_of(run, q, colliders).dot(normal)
             if bounces > 0 and approach > 0:
                 # It parts from where it is at the end of this step or the next, whichever is nearer to the surface.
@@ -156,7 +161,7 @@ class RigidContact:
                     normal[c] = 0.0
                 normal[a] = 1.0 if ti.static(side == 0) else -1.0
         for k in range(colliders.count[run]):
-            i = run * colliders.room + k
+            i = run * colliders.capacity + k
             if k != own and colliders.wall[i] != HOLD:
                 place = ti.cast(x, float)
                 if colliders.covers(i, place):
@@ -219,7 +224,7 @@ class RigidContact:
             if b >= 0:
                 velocity += sign * self.bodies.velocity_at(b, arm)
             elif self.other[q] >= 0:
-                i = run * colliders.room + self.other[q]
+                i = run * colliders.capacity + self.other[q]
                 away = arm - ti.cast(colliders.place[i], ti.f64)
                 velocity -= ti.cast(colliders.velocity[i], ti.f64) + ti.cast(colliders.turning[i], ti.f64) @ away
         return velocity

@@ -10,6 +10,7 @@ import math
 import numpy as np
 
 from mpmcli.boundaries.colliders import Colliders
+from mpmcli.boundaries.doubles import double_field, sin_cos
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
 from mpmcli.scene.rigid import Hinge
@@ -47,23 +48,20 @@ class RigidMotion:
         n = runs * self.count
         self.numbers = ti.field(int, shape=self.count)
         self.numbers.from_numpy(np.array(self.free, np.int32))
-        self.pose = ti.field(ti.f64, shape=(n, self.width))
-        self.momentum, self.rate, self.booked, self.support = (
-            ti.field(ti.f64, shape=(n, self.loads)) for _ in range(4)
-        )
-        self.mass, self.weight, self.square, self.strength, self.motor, self.drive = (
-            ti.field(ti.f64, shape=n) for _ in range(6)
-        )
-        self.inertia = ti.Matrix.field(self.turns, self.turns, ti.f64, shape=n)
-        self.mobility, self.ways = (ti.field(ti.f64, shape=(n, self.loads, self.loads)) for _ in range(2))
+        self.pose = double_field(n, self.width)
+        self.momentum, self.rate, self.booked, self.support = (double_field(n, self.loads) for _ in range(4))
+        self.mass, self.weight, self.square, self.strength, self.motor, self.drive = (double_field(n) for _ in range(6))
+        self.inertia = double_field(n, entries=(self.turns, self.turns))
+        self.mobility, self.ways = (double_field(n, self.loads, self.loads) for _ in range(2))
         self.left, self.spins, self.hinged = (ti.field(int, shape=n) for _ in range(3))
-        self.hinge = ti.Matrix.field(2, self.dimension, ti.f64, shape=n)
-        self.start, self.kick = (ti.Vector.field(self.dimension, kind, shape=n) for kind in (float, ti.f64))
+        self.hinge = double_field(n, entries=(2, self.dimension))
+        self.start = ti.Vector.field(self.dimension, float, shape=n)
+        self.kick = double_field(n, entries=(self.dimension,))
         if self.dimension == 3:
-            self.axes = ti.field(ti.f64, shape=(n, 4, 3))
+            self.axes = double_field(n, 4, 3)
         self.settled = ti.field(int, shape=n)
-        self.system = ti.field(ti.f64, shape=(n, self.loads, self.loads + 1))
-        self.reduced = ti.field(ti.f64, shape=(n, self.loads, 2 * self.loads))
+        self.system = double_field(n, self.loads, self.loads + 1)
+        self.reduced = double_field(n, self.loads, 2 * self.loads)
 
     def write(self, scene: Scene, run: int = 0) -> None:
         """Set the bodies of a run, at time 0."""
@@ -112,7 +110,7 @@ class RigidMotion:
             self.motor[b] = ti.cast(self.pushes.motor(j, run), ti.f64)
             for a in ti.static(range(d)):
                 self.kick[b][a] = ti.cast(push[a], ti.f64)
-                self.momentum[b, a] += self.mass[b] * self.kick[b][a]
+                self.momentum[b, a] = self.momentum[b, a] + self.mass[b] * self.kick[b][a]
                 for c in ti.static(range(d)):
                     self.colliders.turned[i][a, c] = ti.cast(turned[a, c], float)
             self.take_rate(b)
@@ -129,7 +127,7 @@ class RigidMotion:
             i = self.collider_of(run, j)
             speed, spin = ti.cast(0, ti.f64), ti.cast(0, ti.f64)
             for a in ti.static(range(d)):
-                self.pose[b, a] += dt * self.rate[b, a]
+                self.pose[b, a] = self.pose[b, a] + dt * self.rate[b, a]
                 speed += self.rate[b, a] ** 2
             for a in ti.static(range(d, self.loads)):
                 spin += self.rate[b, a] ** 2
@@ -142,9 +140,10 @@ class RigidMotion:
                 if self.hinged[b] == 0:
                     self.take_rate(b)
                 for a in range(self.loads):
-                    self.momentum[b, a] = 0
+                    own = ti.cast(0, ti.f64)
                     for c in range(self.loads):
-                        self.momentum[b, a] += self.system[b, a, c] * self.rate[b, c]
+                        own += self.system[b, a, c] * self.rate[b, c]
+                    self.momentum[b, a] = own
             reached = ti.sqrt(speed) + ti.sqrt(spin) * ti.cast(self.colliders.reach[i][1, 0], ti.f64)
             fastest = ti.max(fastest, ti.cast(reached * reached, float))
         return fastest
@@ -157,7 +156,7 @@ class RigidMotion:
         McLachlan 1997): the energy swings by the square of an angle PART, and does not drift.
         """
         if ti.static(self.dimension == 2):
-            self.pose[b, 2] += dt * self.rate[b, 2]
+            self.pose[b, 2] = self.pose[b, 2] + dt * self.rate[b, 2]
         else:
             q, square = ti.Vector([self.pose[b, 3 + a] for a in range(4)]), ti.cast(0, ti.f64)
             momentum = ti.Vector([self.momentum[b, 3 + a] for a in range(3)])
@@ -169,7 +168,11 @@ class RigidMotion:
                 half = 0.5 * dt * ti.sqrt(square)
                 scale = 0.5 * dt * self.sinc(half)
                 spin = ti.Vector([scale * self.rate[b, 3 + a] for a in range(3)])
-                q = self.product_of(ti.Vector([ti.cos(half), spin[0], spin[1], spin[2]]), q)
+                _s, c = self.sin_cos(half)
+                turned = self.product_of(ti.Vector([c, spin[0], spin[1], spin[2]]), q)
+                # Entry by entry here and below: Taichi may lose vectors that are assigned as a whole.
+                for a in ti.static(range(4)):
+                    q[a] = turned[a]
             for _ in range(parts):
                 for k in range(5):
                     c = 2 - ti.abs(2 - k)
@@ -177,11 +180,13 @@ class RigidMotion:
                     half = 0.5 * dt / parts * momentum.dot(self.carried(q, axis)) / self.axes[b, 3, c]
                     if c < 2:
                         half *= 0.5
-                    s = ti.sin(half)
-                    q = self.product_of(q, ti.Vector([ti.cos(half), s * axis[0], s * axis[1], s * axis[2]]))
-            q = q.normalized()
+                    s, w = self.sin_cos(half)
+                    turned = self.product_of(q, ti.Vector([w, s * axis[0], s * axis[1], s * axis[2]]))
+                    for a in ti.static(range(4)):
+                        q[a] = turned[a]
+            unit = q.normalized()
             for a in ti.static(range(4)):
-                self.pose[b, 3 + a] = q[a]
+                self.pose[b, 3 + a] = unit[a]
 
     @ti.func
     def carried(self, q: ti.template(), v: ti.template()):
@@ -205,7 +210,8 @@ class RigidMotion:
         if self.strength[b] > 0:
             given = self.clamped(b, dt, self.drive[b] + (self.motor[b] - self.rate_of(b)) * self.weight[b])
             for a in range(self.loads):
-                self.momentum[b, a] += self.ways[b, a, 0] * (given - self.drive[b]) / self.square[b]
+                change = self.ways[b, a, 0] * (given - self.drive[b]) / self.square[b]
+                self.momentum[b, a] = self.momentum[b, a] + change
             self.drive[b] = given
             self.take_rate(b)
 
@@ -227,10 +233,10 @@ class RigidMotion:
         """Put the centre of body b where the hinge leaves it, and let it move on about that."""
         d = ti.static(self.dimension)
         rate = self.rate_of(b)
-        arm, spin = ti.Vector.zero(ti.f64, d), ti.Vector.zero(ti.f64, self.turns)
+        own, spin = ti.Vector.zero(ti.f64, d), ti.Vector.zero(ti.f64, self.turns)
         for a in ti.static(range(d)):
-            arm[a] = self.hinge[b][1, a]
-        arm = self.turned(b) @ arm
+            own[a] = self.hinge[b][1, a]
+        arm = self.turned(b) @ own
         for a in ti.static(range(self.turns)):
             spin[a] = self.ways[b, ti.static(d + a), 0]
         along = self.crossed(spin) @ arm
@@ -267,7 +273,9 @@ class RigidMotion:
         own = self.inertia[b]
         if ti.static(d == 3):
             turned = self.turned(b)
-            own = turned @ own @ turned.transpose()
+            carried = turned @ self.inertia[b] @ turned.transpose()
+            for a, c in ti.static(ti.ndrange(3, 3)):
+                own[a, c] = carried[a, c]
         for a in range(self.loads):
             for c in range(self.loads):
                 self.system[b, a, c] = self.mass[b] if a == c else ti.cast(0, ti.f64)
@@ -326,7 +334,18 @@ class RigidMotion:
     @ti.func
     def sinc(self, x: ti.f64):
         """Return sin(x) / x."""
-        return ti.sin(x) / x if x > 0 else ti.cast(1, ti.f64)
+        s, _c = self.sin_cos(x)
+        return s / x if x > 0 else ti.cast(1, ti.f64)
+
+    @ti.func
+    def sin_cos(self, x: ti.f64):
+        """Return sine and cosine."""
+        s, c = ti.cast(0, ti.f64), ti.cast(1, ti.f64)
+        if ti.static(self.colliders.loads.on_cpu):
+            s, c = ti.sin(x), ti.cos(x)
+        else:
+            s, c = sin_cos(x)
+        return s, c
 
     # Of a body.
 
@@ -388,7 +407,7 @@ class RigidMotion:
         d = ti.static(self.dimension)
         result = ti.Matrix.zero(ti.f64, d, d)
         if ti.static(d == 2):
-            c, s = ti.cos(self.pose[b, 2]), ti.sin(self.pose[b, 2])
+            s, c = self.sin_cos(self.pose[b, 2])
             result[0, 0], result[0, 1], result[1, 0], result[1, 1] = c, -s, s, c
         else:
             cross = self.crossed(ti.Vector([self.pose[b, 4 + a] for a in range(3)]))
@@ -415,4 +434,4 @@ class RigidMotion:
     @ti.func
     def collider_of(self, run: int, j: int):
         """Return the index of the j-th body among the colliders of all runs."""
-        return run * self.colliders.room + self.numbers[j]
+        return run * self.colliders.capacity + self.numbers[j]

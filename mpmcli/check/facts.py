@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from mpmcli.check.geometry import image_shifts, spanned_axes, thickness
-from mpmcli.check.scene_limits import SceneLimit, joined, law_of, reachable, scene_limits, smallest, starts_of
+from mpmcli.check.scene_limits import SceneLimit, joined, law_of, reachable, scene_limits, starts_of
 from mpmcli.materials.law import Law, StateBound
 from mpmcli.scene import Body, Scene, SceneBounds
 from mpmcli.scene.sampling import moves_unevenly
@@ -88,8 +88,10 @@ class SceneFacts:
         self.deformed = any(start.bound != StateBound() for start in self.starts)
         self.bounds: SceneBounds = reachable(scene, self.starts)
         self.limits: tuple[SceneLimit, ...] = tuple(scene_limits(scene, self.bounds, self.starts))
-        self.binding = smallest(self.limits)
-        self.binding_at_start = smallest(self.limits, at_rest=True)
+        # Of two that are equal, the one at rest, which comes first.
+        self.binding = min(self.limits, key=lambda limit: limit.value)
+        at_rest = (limit for limit in self.limits if limit.state == "rest")
+        self.binding_at_start = min(at_rest, key=lambda limit: limit.value)
         self.step = scene.time.safety * self.binding.value
         self.step_at_start = scene.time.safety * self.binding_at_start.value
         self.interval = scene.time.end / scene.time.frames
@@ -133,11 +135,6 @@ class SceneFacts:
         """Return the step of a run in which `step` (s) is stable: at most time.step and the interval of the frames."""
         asked = self.scene.time.step
         return min(step, self.interval, step if asked == "auto" else asked)
-
-    @property
-    def first_contact(self) -> float:
-        """Time of the first contact of any body, s; until then no material is stiffer than at rest."""
-        return min((facts.arrival.time for facts in self.bodies), default=0.0)
 
 
 def arrivals(scene: Scene, fastest: float = 0.0, *, pressed: bool = False) -> list[Arrival]:

@@ -15,34 +15,20 @@ SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 
 @dataclass(frozen=True)
 class Finding:
-    """One finding of a check.
+    """One finding of a check."""
 
-    Attributes:
-        severity: "error": the run or result is wrong; "warning": it is probably wrong; "note": information only.
-        rule: short name of the rule, such as "thin-body".
-        what: one sentence that states the finding, with numbers and units.
-        fix: one sentence that states what to change.
-        value: number that triggers the finding, or None.
-        body: name of the body concerned, "" if there is no single one.
-        frame: index of the first frame concerned, None for a scene or if there is no particular frame.
-    """
-
-    severity: Severity
-    rule: str
-    what: str
-    fix: str
-    value: float | None = None
-    body: str = ""
-    frame: int | None = None
+    severity: Severity  # "error": the run or result is wrong; "warning": probably; "note": information only
+    rule: str  # short name, such as "thin-body"
+    what: str  # one sentence that states the finding, with numbers and units
+    fix: str  # one sentence that states what to change
+    value: float | None = None  # that triggers the finding
+    body: str = ""  # name of the body concerned, "" if there is no single one
+    frame: int | None = None  # index of the first one concerned, None for a scene or if there is none in particular
 
     @property
     def line(self) -> str:
         """The finding in one line: severity, what, and what to change."""
         return f"{self.severity}: {self.what} {self.fix}"
-
-    def as_dict(self) -> dict:
-        """Return the finding as a dictionary for JSON."""
-        return dict(vars(self))
 
 
 def gravest_first(findings: Iterable[Finding]) -> tuple[Finding, ...]:

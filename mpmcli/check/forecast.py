@@ -1,26 +1,29 @@
-"""Forecast of the steps, time, memory and disk space of a run, and the rules on frames, disk and memory."""
+"""Forecast of the steps, time, memory and disk space of a run, by a probe or without, and the rules on the last two."""
 
 import math
 import shutil
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from timeit import repeat
 
 import numpy as np
 
 from mpmcli.check.facts import BodyFacts, SceneFacts
 from mpmcli.check.finding import Finding
-from mpmcli.check.probe import Probe
 from mpmcli.errors import InputError
 from mpmcli.output.durable import largest_file
 from mpmcli.output.layout import POSITION, ArrayLayout, FrameLayout
 from mpmcli.output.store import HOLD
 from mpmcli.plain_text import size_text
-from mpmcli.scene import Scene, scene_to_toml
+from mpmcli.scene import LoadedScene, Scene, scene_to_toml
 from mpmcli.scene.schema import SolverSettings
+from mpmcli.solver.engine.run import backend_for, build_run
 from mpmcli.solver.frames.builder import POSITION_ERROR
-from mpmcli.solver.machine.costs import cheapest, cost_of
-from mpmcli.solver.machine.plan import Plan, require_room
+from mpmcli.solver.frames.diagnosis import UnstableRunError
+from mpmcli.solver.machine.backend import Backend, start
+from mpmcli.solver.machine.plan import Plan, cheapest, cost_of, make_plan, require_memory
 from mpmcli.solver.transfer.kept_motion import OWN_STEP, own_limit
 from mpmcli.stability.transfer_factors import loss_per_step
 
@@ -45,8 +48,57 @@ DISK_PASSES = 4
 MOST_FRAMES = 100_000
 # While the frames are packed, two copies are on the disk.
 COPIES = 2
-# Default solver settings.
-USUAL = SolverSettings()
+# Wall time of the steps that are counted, s.
+SECONDS = 2.0
+# Steps that are not counted: the first compiles, and the next fill the caches of the processor.
+WARM_UP = 3
+
+
+@dataclass(frozen=True)
+class Probe:
+    """Measured cost of a run's start: seconds to start, to compile, of a step (None: unstable before) and a frame."""
+
+    backend: Backend
+    start_seconds: float
+    compile_seconds: float
+    step_seconds: float | None
+    frame_seconds: float
+    steps: int
+    failure: str = ""
+
+
+def probe_scene(loaded: LoadedScene, steps: int, *, threads: int | None = None) -> tuple[Probe, Plan]:
+    """Run a scene for SECONDS of its `steps`; return cost and plan. InputError: no backend, or little memory."""
+    scene = loaded.scene
+    began = time.perf_counter()
+    backend = backend_for(scene, lambda: steps, "auto", threads)
+    start(backend)
+    plan = make_plan(scene, backend)
+    require_memory(plan)
+    run = build_run(scene, backend)
+    started = time.perf_counter() - began
+    run.begin()
+    run.frame()
+    first_frame = time.perf_counter() - began - started
+    # The smallest of three: the second frame allocates memory, later ones reuse it.
+    frame = min(repeat(run.frame, number=1, repeat=3))
+    compiled = max(0.0, first_frame - frame)
+    measured, spent, failure = 0, 0.0, ""
+    try:
+        warm = time.perf_counter()
+        run.advance(WARM_UP)
+        compiled += time.perf_counter() - warm
+        # A run launches and waits at least once for each frame.
+        chunk, most = 1, max(1, round(steps / scene.time.frames))
+        since = time.perf_counter()
+        while measured == 0 or (spent < SECONDS and run.time < scene.time.end):
+            measured += run.advance(chunk)[0]
+            spent = time.perf_counter() - since
+            chunk = max(1, min(most, int(measured / spent * (SECONDS - spent))))
+    except UnstableRunError as error:
+        failure = str(error)
+    step_seconds = spent / measured if measured else None
+    return Probe(backend, started, compiled, step_seconds, frame, run.step_count, failure), plan
 
 
 @dataclass(frozen=True)
@@ -71,10 +123,6 @@ class Forecast:
     file_bytes: int
     vtk_bytes: int
 
-    def as_dict(self) -> dict:
-        """Return the forecast as a dictionary for JSON."""
-        return {**vars(self), "steps_range": list(self.steps_range)}
-
 
 def forecast_of(facts: SceneFacts, plan: Plan, probe: Probe | None, threads: int) -> Forecast:
     """Return the forecast of a run on some threads; times are those of the probe, if there is one."""
@@ -84,27 +132,18 @@ def forecast_of(facts: SceneFacts, plan: Plan, probe: Probe | None, threads: int
     frames = scene.time.frames + 1
     start, compiling, step, frame = START_SECONDS, None, None, 0.0
     if probe is not None:
-        start, compiling, step, frame = (
-            probe.start_seconds,
-            probe.compile_seconds,
-            probe.step_seconds,
-            probe.frame_seconds,
-        )
+        start, frame = probe.start_seconds, probe.frame_seconds
+        compiling, step = probe.compile_seconds, probe.step_seconds
     elif plan.arch == "cpu":
         cost = cost_of(scene, cheapest(scene, steps, threads))
         compiling, step = cost.compile, cost.step_on(threads)
     seconds = None
     if compiling is not None and step is not None:
         computing = steps * step + frames * frame
-        seconds = (
-            start
-            + compiling
-            + computing
-            + frames * FRAME_SECONDS
-            # Frames are sealed in groups, once in HOLD seconds.
-            + min(frames, 1 + computing / HOLD) * SEAL_SECONDS
-            + DISK_PASSES * file_bytes / DISK_BYTES_PER_SECOND
-        )
+        # Frames are sealed in groups, once in HOLD seconds.
+        sealing = min(frames, 1 + computing / HOLD) * SEAL_SECONDS
+        seconds = start + compiling + computing + frames * FRAME_SECONDS + sealing
+        seconds += DISK_PASSES * file_bytes / DISK_BYTES_PER_SECOND
     return Forecast(
         steps=steps,
         steps_range=(steps_at(facts, facts.step_at_start), steps_at(facts, facts.step)),
@@ -132,7 +171,9 @@ def expected_steps(facts: SceneFacts) -> int:
     Elastic bodies keep oscillating after an impact, and hardening is permanent. Frames divide both parts.
     """
     frames = facts.scene.time.frames
-    free = min(1.0, facts.first_contact / facts.scene.time.end)
+    # Until then no material is stiffer than at rest.
+    first_contact = min((body.arrival.time for body in facts.bodies), default=0.0)
+    free = min(1.0, first_contact / facts.scene.time.end)
     before, after = (steps_at(facts, step) / frames for step in (facts.step_at_start, facts.step_expected))
     whole = math.floor(free * frames)
     mixed = (free * frames - whole) * before + (1 - free * frames + whole) * after if whole < frames else 0.0
@@ -152,7 +193,7 @@ def damped_step(facts: SceneFacts, body: BodyFacts, step: float, shorter: float 
     return max(step, OWN_STEP * shorter * own_limit(body.body, body.law, facts.scene))
 
 
-def wave_loss(thickness: float, spacing: float, step: float, settings: SolverSettings = USUAL) -> float:
+def wave_loss(thickness: float, spacing: float, step: float, settings: SolverSettings) -> float:
     """Return the share of energy per second that the longest wave across a body loses at a step (s), 1/s.
 
     Its wave number is k = pi / thickness. A step of a body's own length is damped (docs/theory.md, 2.4).
@@ -217,7 +258,7 @@ def output_findings(facts: SceneFacts, plan: Plan, forecast: Forecast, directory
         fix = "Raise the limit on the size of a file (ulimit -f), or store fewer frames or output.fields."
         yield Finding("warning", "disk", what, fix, forecast.file_bytes)
     try:
-        require_room(plan)
+        require_memory(plan)
     except InputError as error:
         what, _, fix = str(error).rstrip(".").rpartition("; ")
         total = plan.device_bytes + plan.host_bytes

@@ -128,10 +128,7 @@ def distance_between(first: Form, second: Form) -> float:
 
 def _distance_from(point: np.ndarray, form: Form) -> float:
     """Return the distance of a point, (d,), from a shape, m; 0 inside."""
-    if isinstance(form, Polygon):
-        inside = bool(form.contains(point[None])[0])
-        return 0.0 if inside else float(edge_distances(point[None], np.array(form.vertices))[0])
-    return float(np.linalg.norm(point - _nearest_in(point, form)))
+    return max(0.0, float(form.signed_distance(point[None])[0]))
 
 
 def _outline(form: Form) -> np.ndarray:
@@ -145,15 +142,9 @@ def _outline(form: Form) -> np.ndarray:
 
 
 def _nearest_in(point: np.ndarray, form: Form) -> np.ndarray:
-    """Return the nearest point of a convex shape, (d,)."""
+    """Return the nearest point of a box or a cylinder, (d,)."""
     if isinstance(form, Box):
         return np.clip(point, *form.bounds())
-    if isinstance(form, Ball):
-        return _nearest_in_ball(point, np.array(form.center), form.radius)
-    if isinstance(form, Capsule):
-        a, b = np.array(form.start), np.array(form.end)
-        t = np.clip((point - a) @ (b - a) / np.dot(b - a, b - a), 0.0, 1.0)
-        return _nearest_in_ball(point, a + t * (b - a), form.radius)
     assert isinstance(form, Cylinder)
     axis = form.direction
     offset = point - np.array(form.base)
@@ -164,27 +155,18 @@ def _nearest_in(point: np.ndarray, form: Form) -> np.ndarray:
     return np.array(form.base) + np.clip(along, 0.0, form.height) * axis + across
 
 
-def _nearest_in_ball(point: np.ndarray, center: np.ndarray, radius: float) -> np.ndarray:
-    offset = point - center
-    reach = float(np.linalg.norm(offset))
-    return point if reach <= radius else center + offset * (radius / reach)
-
-
 def _distance_of_segment(a: np.ndarray, b: np.ndarray, form: Form) -> float:
-    """Return the distance of the segment between a and b, (d,) each, from a convex shape, m, by ternary search."""
-    low, high = 0.0, 1.0
-    while high - low > 1e-8:
-        one, two = (2 * low + high) / 3, (low + 2 * high) / 3
-        # Where both are 0 the minimum is between them.
-        if _distance_from(a + one * (b - a), form) <= _distance_from(a + two * (b - a), form):
-            high = two
-        else:
-            low = one
-    return _distance_from(a + (low + high) / 2 * (b - a), form)
+    """Return the distance of the segment between a and b, (d,) each, from a convex shape, m."""
+    from scipy.optimize import minimize_scalar
+
+    found = minimize_scalar(
+        lambda t: _distance_from(a + t * (b - a), form), bounds=(0, 1), method="bounded", options={"xatol": 1e-8}
+    )
+    return float(found.fun)
 
 
 def _distance_of_convex(first: Form, second: Form) -> float:
-    """Return the distance of two convex shapes, m, by alternating projections (Cheney and Goldstein 1959)."""
+    """Return the distance of boxes or cylinders, m, by alternating projections (Cheney and Goldstein 1959)."""
     b = np.mean(second.bounds(), axis=0)
     before = np.inf
     for _ in range(ROUNDS):

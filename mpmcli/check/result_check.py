@@ -1,22 +1,25 @@
-"""`mpmcli check RESULT`: whether a run stayed stable and its frames are complete."""
+"""`mpmcli check RESULT`: whether a run stayed stable, by its ledger and its frames, and its frames are complete."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
+from math import isfinite
+from numbers import Real
 from pathlib import Path
 
 import numpy as np
 
 from mpmcli.check.finding import Finding, FrameFindings, Verdict, passes
-from mpmcli.check.result_entries import RUN_AGAIN, OpenedResult, check_order, kept_entries, open_entries
-from mpmcli.check.result_ledger import check_ledger
-from mpmcli.check.result_state import CrowdCheck, MomentumCheck, StateCheck, StretchCheck
+from mpmcli.check.result_entries import RUN_AGAIN, Entry, OpenedResult, check_order, open_entries
+from mpmcli.check.result_state import BLOWN_UP, CRUSHED, CrowdCheck, MomentumCheck, StateCheck, StretchCheck
 from mpmcli.errors import InputError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
+from mpmcli.output.checksums import first_line
 from mpmcli.output.header import RunHeader
-from mpmcli.output.reading import first_line
-from mpmcli.output.segments import PACKED
+from mpmcli.output.layout import PACKED
 from mpmcli.plain_json import finite_json
+from mpmcli.stability.limits import COURANT
 
 # Labels of the figures in text.
 TOLD = {
@@ -38,6 +41,31 @@ TOLD = {
     "step_min": "smallest step, s",
     "step_max": "largest step, s",
 }
+# Growth of energy without a source, relative to the energy turned over (docs/theory.md, 9.3). The scenes in configs
+# whose bodies share one velocity field stay below 2e-4, bodies thrown at a wall at up to five times their speed of
+# sound below 1e-3.
+ENERGY_SUSPECT, ENERGY_WRONG = 1e-2, 1e-1
+# The same where bodies separate: while they touch contact holds energy that the ledger does not have. A block of jelly
+# of 10 cells that rests on a floor has up to 0.03.
+CONTACT_SUSPECT = 5e-2
+# Rounding of energy in single precision, relative to the total energy.
+ENERGY_ROUNDING = 1e-4
+# Masses are summed in double precision and never change.
+MASS_ERROR = 1e-9
+# Volume that liquids and grains fill beyond that of their particles, or lack, as a fraction, in every frame of the last
+# quarter: in flight it may be more for a moment.
+VOLUME_ERROR, QUARTER = 0.05, 4
+# A bound may be exceeded by this factor in an impact; time.safety allows for it.
+MARGIN = 1.1
+# Smallest accepted ratio of a step to the first one.
+COLLAPSE = 1e-2
+# Cells per step above which particles leave all nodes that they act on. Impacts near the speed of sound reach 1.7 in
+# single steps without a gain of energy: it is the speed of a node, which particles rarely reach.
+LEFT_BEHIND = 2.0
+# Cells by which surfaces may overlap: more than what is driven by a paddle does, 0.6.
+OVERLAP = 1.0
+LOWER_SAFETY = "Lower time.safety, or refine the domain."
+STIFFER = "Make the material stiffer, the domain finer, or time.safety lower."
 
 
 @dataclass(frozen=True)
@@ -73,7 +101,7 @@ class ResultCheck:
 
     def as_dict(self) -> dict:
         """Return the check as a dictionary for JSON."""
-        findings = [finite_json(finding.as_dict()) for finding in self.findings]
+        findings = [finite_json(dict(vars(finding))) for finding in self.findings]
         own = {**vars(self), "findings": findings, "figures": finite_json(self.figures), "path": str(self.path)}
         return {"ok": self.passes(), "verdict": self.verdict, **own}
 
@@ -104,7 +132,11 @@ def check_result(path: Path) -> ResultCheck:
 
 def check_kept(header: RunHeader, frames: Sequence[Frame], ledger: Sequence[LedgerRow]) -> ResultCheck:
     """Check all frames of a finished run in memory, as `check_result` checks files, but not for changes since."""
-    return _check(kept_entries(header, frames, ledger), FrameFindings())
+    entries = [
+        Entry(frame.index, frame.time, row, len(frame.body), lambda frame=frame: frame)
+        for frame, row in zip(frames, ledger, strict=True)
+    ]
+    return _check(OpenedResult(Path(), "memory", header, {"status": "finished"}, entries), FrameFindings())
 
 
 def _check(opened: OpenedResult, findings: FrameFindings) -> ResultCheck:
@@ -163,3 +195,123 @@ def _limit_at(opened: OpenedResult, number: int) -> str:
         return str(failure["limit"])
     rows = [entry.row for entry in opened.entries if entry.number <= max(number, 1)]
     return next((row.limit for row in reversed(rows) if row.limit), "")
+
+
+def check_ledger(entries: Sequence[Entry], header: RunHeader, findings: FrameFindings) -> dict[str, float | None]:
+    """Check all rows, and return figures by name, see `ResultCheck`; None if not available."""
+    numbers, rows = [], []
+    for entry in entries:
+        broken = next((name for name, value in vars(entry.row).items() if not _finite(value)), "")
+        if broken:
+            what = f"In frame {entry.number} {broken} of the ledger is not finite"
+            findings.add("error", "ledger-not-finite", entry.number, what, LOWER_SAFETY)
+        else:
+            numbers.append(entry.number)
+            rows.append(entry.row)
+    if not rows:
+        return {}
+    numeric = [name for name, value in vars(rows[0]).items() if isinstance(value, Real)]
+    of = {name: np.array([getattr(row, name) for row in rows]) for name in numeric}
+
+    def tell(rule: str, values: np.ndarray, bad: np.ndarray, wrong: np.ndarray | bool, what: str, fix: str) -> None:
+        """Add a finding for each row that is bad, an error where it is wrong, too."""
+        for k in np.flatnonzero(bad).tolist():
+            severity, value = "error" if (bad & wrong)[k] else "warning", float(values[k])
+            said = what.format(number=numbers[k], value=value, row=rows[k])
+            findings.add(severity, rule, numbers[k], said, fix, value, kind=what)
+
+    # What came in since the start and what left is not counted. The median identifies a single row, also the first.
+    emitted = of.get("emitted_mass", np.zeros(len(rows)))
+    mass = of["mass"] - emitted + of.get("retired_mass", 0.0)
+    usual = float(np.median(mass))
+    scale, change = np.maximum(usual, emitted), np.abs(mass - usual)
+    change = np.divide(change, scale, out=(change > 0).astype(float), where=scale > 0)
+    what = f"In frame {{number}} the mass is {{row.mass:.8g}} kg, where the run has {usual:.8g} kg"
+    fix = "The file was changed after the run; copy it again or run the scene again."
+    tell("mass", change, change > MASS_ERROR, True, what, fix)
+    growth, lost = energy_change(of["kinetic"], of["potential"], of["elastic"])
+    conserved = not (header.driven or header.moved)
+    if not conserved:
+        what = (
+            "Forces, walls that move, or a gravity that depends on time or acts along a periodic axis do work, so that "
+        )
+        what += "energy and momentum are not conserved"
+        if header.comes_and_goes:
+            what = "Material comes or goes, so that energy and momentum are not conserved"
+        elif not header.driven:
+            what = "Colliders that move do work, so that energy is not conserved"
+        findings.add("note", "driven", None, what, "Nothing needs to be done.")
+    else:
+        what = "By frame {number} the energy has grown by {value:.3g} of the energy turned over, without a source"
+        elastic = any(law.coherent and law.deformation == "F" and not law.projects for law in header.laws)
+        suspect = CONTACT_SUSPECT if elastic and header.scene.contact.separates else ENERGY_SUSPECT
+        tell("energy", growth, growth > suspect, growth > ENERGY_WRONG, what, LOWER_SAFETY)
+    courant, forced = of["courant_max"], any(row.limit == "forced" for row in rows)
+    what = f"Before frame {{number}} something moved {{value:.3g}} cells in a step, {COURANT:g} is safe"
+    fix = 'Set time.step = "auto".' if forced else LOWER_SAFETY
+    tell("courant", courant, courant > COURANT * MARGIN, courant > LEFT_BEHIND, what, fix)
+    overlap = of.get("contact_overlap", np.zeros(len(rows)))
+    what = "Before frame {number} surfaces that met overlapped by {value:.3g} cells"
+    tell("overlap", overlap, overlap > OVERLAP, False, what, STIFFER)
+    low, high = of["volume_ratio_min"], of["volume_ratio_max"]
+    what = "In frame {number} a particle has no volume left: the smallest J is {value:.4g}"
+    tell("volume", low, low <= 0, True, what, STIFFER)
+    what = "In frame {number} a particle is crushed: the smallest J is {value:.4g}"
+    tell("volume", low, (low > 0) & (low < CRUSHED), False, what, STIFFER)
+    coherent = bool(header.laws) and all(law.coherent for law in header.laws)
+    what = "In frame {number} a particle is blown up: the largest J is {value:.4g}"
+    tell("volume", high, (high > BLOWN_UP) & coherent, False, what, STIFFER)
+    stepped = of["steps"] > 0
+    steps: dict[str, float | None] = dict.fromkeys(("step_min", "step_max", "step_ratio"))
+    if stepped.any():
+        first, smallest = float(of["step_max"][stepped][0]), float(of["step_min"][stepped].min())
+        ratio = of["step_min"] / first
+        what = "Before frame {number} the step fell to {row.step_min:.3g} s, where the run began with "
+        what += f'{first:.3g} s, by the bound "{{row.limit}}"'
+        fix = "Look for a high speed, stiffness or deformation in this frame."
+        tell("step-collapse", ratio, stepped & (ratio < COLLAPSE), False, what, fix)
+        steps = {"step_min": smallest, "step_max": float(of["step_max"].max()), "step_ratio": smallest / first}
+    took = [(row.collider_force, row.time - before.time) for before, row in pairwise(rows) if row.collider_force]
+    impulse = sum(np.sum(force, axis=0) * time for force, time in took)
+    return {
+        "mass_change": float(change.max()),
+        "energy_growth": float(growth.max()) if conserved else None,
+        "energy_lost": lost if conserved else None,
+        "courant_max": float(courant.max()),
+        "speed_max": float(of["speed_max"].max()),
+        "volume_ratio_min": float(low.min()),
+        "volume_ratio_max": float(high.max()),
+        "volume_error": _volume_error(numbers, of["volume_error"], findings),
+        "collider_impulse": float(np.linalg.norm(impulse)) if took else None,
+        **{name: float(of[name].max()) if name in of else None for name in ("contact_overlap", "contact_gap")},
+        **steps,
+    }
+
+
+def _finite(value: object) -> bool:
+    if isinstance(value, tuple | list):
+        return all(map(_finite, value))
+    return value is None or isinstance(value, str) or isfinite(value)
+
+
+def energy_change(kinetic: np.ndarray, potential: np.ndarray, elastic: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the growth above the minimum so far, (T,), and what is lost in the end, over the energy turned over."""
+    total = kinetic + potential + elastic
+    highest, lowest = np.maximum.accumulate, np.minimum.accumulate
+    turned = highest(kinetic) + (highest(potential) - lowest(potential)) + (highest(elastic) - lowest(elastic))
+    turned += ENERGY_ROUNDING * highest(kinetic + np.abs(potential) + np.abs(elastic))
+    turned = np.maximum(turned, np.finfo(np.float64).tiny)
+    return (total - lowest(total)) / turned, float((total[0] - total[-1]) / turned[-1])
+
+
+def _volume_error(numbers: Sequence[int], errors: np.ndarray, findings: FrameFindings) -> float:
+    """Return the volume error that lasts to the end: the smallest one of the last quarter, 0 where its sign changes."""
+    last = errors[-max(len(errors) // QUARTER, 1) :]
+    first = numbers[-len(last)]
+    lasting = float(last[np.abs(last).argmin()]) if abs(np.sign(last).sum()) == len(last) else 0.0
+    if abs(lasting) > VOLUME_ERROR:
+        what = f"From frame {first} to the end liquids and grains fill {100 * abs(lasting):.3g} % "
+        what += f"{'more' if lasting > 0 else 'less'} than the volume of their particles"
+        fix = "Refine the domain. Of the materials, fluids with volume_correction and sand correct their volume."
+        findings.add("note", "volume-error", first, what, fix, value=lasting)
+    return lasting

@@ -1,6 +1,6 @@
 """Opens a result that may be damaged, and checks that it holds each frame at its time, and how the run ended."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from itertools import count
@@ -11,12 +11,12 @@ from mpmcli.check.finding import FrameFindings, Severity
 from mpmcli.errors import InputError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
+from mpmcli.output.checksums import DamageError, first_line
 from mpmcli.output.durable import number_of
 from mpmcli.output.header import RunHeader
-from mpmcli.output.reading import DamageError, first_line
+from mpmcli.output.layout import PACKED, sealed_segments
 from mpmcli.output.result import open_result, result_place
 from mpmcli.output.run_record import DIED, ELSEWHERE, read_record, run_status
-from mpmcli.output.segments import PACKED, sealed_segments
 
 RUN_AGAIN = "Copy the file again from where it was made, or run the scene again."
 GO_ON = "mpmcli simulate --resume goes on with it."
@@ -74,15 +74,6 @@ class OpenedResult:
     def last(self) -> int:
         """Number of the last frame, -1 without any."""
         return max((entry.number for entry in self.entries), default=-1)
-
-
-def kept_entries(header: RunHeader, frames: Sequence[Frame], ledger: Sequence[LedgerRow]) -> OpenedResult:
-    """Return the frames of a run in memory that has finished, with the rows of its ledger."""
-    entries = [
-        Entry(frame.index, frame.time, row, len(frame.body), lambda frame=frame: frame)
-        for frame, row in zip(frames, ledger, strict=True)
-    ]
-    return OpenedResult(Path(), "memory", header, {"status": "finished"}, entries)
 
 
 def open_entries(path: Path, findings: FrameFindings) -> OpenedResult:

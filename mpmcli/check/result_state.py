@@ -331,8 +331,8 @@ class CrowdCheck(FrameCheck):
             own = J[frame.body == label]
             if body.material.get("viscosity", 0) >= VISCOUS and len(own) and own.mean() > OPENED:
                 mean, name = float(own.mean()), body.name
-                what = f'In frame {frame.index} the viscous liquid of "{name}" has a mean J of {mean:.3g}'
-                fix = "Refine the domain across it, or pour it thicker."
-                self._findings.add(
-                    "note", "spray", frame.index, f"{what}: it falls apart", fix, value=mean, body=name, kind=name
+                what = (
+                    f'In frame {frame.index} the viscous liquid of "{name}" has a mean J of {mean:.3g}: it falls apart'
                 )
+                fix = "Refine the domain across it, or pour it thicker."
+                self._findings.add("note", "spray", frame.index, what, fix, value=mean, body=name, kind=name)

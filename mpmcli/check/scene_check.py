@@ -4,21 +4,18 @@ from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
-from mpmcli.check.drive_rules import drive_findings
 from mpmcli.check.facts import SceneFacts
 from mpmcli.check.finding import SEVERITIES, Finding, gravest_first, passes
-from mpmcli.check.forecast import Forecast, forecast_of, output_findings
+from mpmcli.check.forecast import Forecast, Probe, forecast_of, output_findings
 from mpmcli.check.material_rules import material_findings
-from mpmcli.check.probe import Probe
-from mpmcli.check.shape_rules import shape_findings
+from mpmcli.check.shape_rules import drive_findings, shape_findings
 from mpmcli.check.step_rules import loss_findings, rounding_findings, step_findings
 from mpmcli.cores import available_cores
 from mpmcli.errors import InputError
 from mpmcli.plain_text import counted, size_text, text_table
 from mpmcli.scene import LoadedScene
 from mpmcli.solver.machine.backend import Backend
-from mpmcli.solver.machine.costs import useful_threads
-from mpmcli.solver.machine.plan import Plan, make_plan
+from mpmcli.solver.machine.plan import Plan, make_plan, useful_threads
 
 # A scene of more steps is rejected; the counts of a forecast are exact below 2^53.
 MOST_STEPS = 1e15
@@ -44,12 +41,16 @@ class SceneCheck:
 
     def text(self) -> str:
         """Return the check as text: limits, findings, plan, forecast, and the outcome."""
+        facts, first, later = self.facts, self.facts.binding_at_start, self.facts.binding
+        steps = [f"Step that is safe throughout: {facts.step:.4g} s. {later.why} {later.fix}"]
+        if first is not later:
+            steps.append(f"Step at the start: {facts.step_at_start:.4g} s. {first.why} {first.fix}")
         counts = Counter(finding.severity for finding in self.findings)
         counted_findings = [counted(counts[word], word) for word in SEVERITIES if counts[word]]
         parts = [
             "\n".join(filter(None, [self.loaded.scene.title, *self.loaded.notes])),
-            _limits_text(self.facts),
-            _steps_text(self.facts),
+            _limits_text(facts),
+            "\n".join(steps),
             _findings_text(self.findings),
             _plan_text(self.plan),
             _forecast_text(self.forecast),
@@ -81,9 +82,9 @@ class SceneCheck:
                 {**limit.as_dict(), "binds": limit is always, "binds_at_start": limit is at_start}
                 for limit in facts.limits
             ],
-            "findings": [finding.as_dict() for finding in self.findings],
+            "findings": [dict(vars(finding)) for finding in self.findings],
             "plan": {**self.plan.as_dict(), "bytes_per_particle": self.plan.bytes_per_particle},
-            "forecast": self.forecast.as_dict(),
+            "forecast": vars(self.forecast),
             "notes": list(self.loaded.notes),
         }
 
@@ -145,14 +146,6 @@ def _limits_text(facts: SceneFacts) -> str:
     return table + (f"\nand {left_out} that bind less" if left_out else "")
 
 
-def _steps_text(facts: SceneFacts) -> str:
-    first, later = facts.binding_at_start, facts.binding
-    lines = [f"Step that is safe throughout: {facts.step:.4g} s. {later.why} {later.fix}"]
-    if first is not later:
-        lines.append(f"Step at the start: {facts.step_at_start:.4g} s. {first.why} {first.fix}")
-    return "\n".join(lines)
-
-
 def _findings_text(findings: tuple[Finding, ...]) -> str:
     """Return one line for each finding, and of each rule the first MOST_ALIKE only."""
     lines, told = [], Counter[str]()
@@ -193,10 +186,6 @@ def _took_text(forecast: Forecast) -> str:
     compiling = f"{forecast.compile_seconds:.2g} s of it to compile"
     if not forecast.measured:
         compiling += ", unless a run of this kind did; by a table of measured kinds"
-    return f", {_time_text(forecast.seconds)} ({compiling})"
-
-
-def _time_text(seconds: float) -> str:
-    if seconds < 120:
-        return f"about {seconds:.2g} s"
-    return f"about {seconds / 60:.2g} min" if seconds < 7200 else f"about {seconds / 3600:.2g} h"
+    seconds = forecast.seconds
+    length, unit = (1, "s") if seconds < 120 else (60, "min") if seconds < 7200 else (3600, "h")
+    return f", about {seconds / length:.2g} {unit} ({compiling})"

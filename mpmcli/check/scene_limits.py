@@ -62,26 +62,24 @@ def law_of(body: Body, dimension: int) -> Law:
 
 def starts_of(scene: Scene) -> list[Start]:
     """Return the start of each body, in the order of the scene."""
-    return [_start_of(body, index, scene) for index, body in enumerate(scene.bodies)]
-
-
-def _start_of(body: Body, index: int, scene: Scene) -> Start:
-    if body.deformation is None and body.initial_pressure is None:
-        return Start()
-    deformation = initial_deformation(body, body_places(body, index, scene.domain.spacing), scene.domain)
-    if deformation.ndim == 1:
-        J, stretch_squared = deformation, deformation**2
-    else:
-        J = np.linalg.det(deformation)
-        # The row sum of |F F^T| that a run measures.
-        stretch_squared = np.abs(deformation @ deformation.swapaxes(1, 2)).sum(axis=2).max(axis=1)
-    sound = np.isfinite(J) & np.isfinite(stretch_squared)
-    if not sound.any():
-        return Start()
-    J, stretch_squared, deformation = J[sound], stretch_squared[sound], deformation[sound]
-    bound = StateBound(float(J.min()), float(J.max()), float(stretch_squared.max()))
-    energy = law_of(body, scene.dimension).stored_energy(body.material, deformation)
-    return Start(bound, float(np.max(energy, initial=0.0, where=np.isfinite(energy))))
+    starts = [Start()] * len(scene.bodies)
+    for index, body in enumerate(scene.bodies):
+        if body.deformation is None and body.initial_pressure is None:
+            continue
+        deformation = initial_deformation(body, body_places(body, index, scene.domain.spacing), scene.domain)
+        if deformation.ndim == 1:
+            J, stretch_squared = deformation, deformation**2
+        else:
+            J = np.linalg.det(deformation)
+            # The row sum of |F F^T| that a run measures.
+            stretch_squared = np.abs(deformation @ deformation.swapaxes(1, 2)).sum(axis=2).max(axis=1)
+        sound = np.isfinite(J) & np.isfinite(stretch_squared)
+        if sound.any():
+            J, stretch_squared = J[sound], stretch_squared[sound]
+            bound = StateBound(float(J.min()), float(J.max()), float(stretch_squared.max()))
+            energy = law_of(body, scene.dimension).stored_energy(body.material, deformation[sound])
+            starts[index] = Start(bound, float(np.max(energy, initial=0.0, where=np.isfinite(energy))))
+    return starts
 
 
 def reachable(scene: Scene, starts: Sequence[Start]) -> SceneBounds:
@@ -118,19 +116,13 @@ def scene_limits(scene: Scene, bounds: SceneBounds, starts: Sequence[Start] | No
     return [*limits, *_motion_limits(scene, bounds, _release_speed(scene, starts))]
 
 
-def smallest(limits: Sequence[SceneLimit], *, at_rest: bool = False) -> SceneLimit:
-    """Return the smallest limit, in any state or at the start; of two that are equal, the one at rest."""
-    chosen = [limit for limit in limits if limit.state == "rest" or not at_rest]
-    return min(chosen, key=lambda limit: limit.value)
-
-
 def _material_limits(body: Body, law: Law, state: str, bound: StateBound, scene: Scene) -> Iterator[SceneLimit]:
     """Yield the smallest limit of each name that the modes of one body set in one state."""
     density, spacing, solver = body.material.density, scene.domain.spacing, scene.solver
     inertia = step_inertia(solver)
     smallest: dict[str, tuple[float, float, float]] = {}
     modes = law.reference_modes if solver.solids == "total" else law.modes
-    for mode in modes(body.material, law.swung(bound)):
+    for mode in modes(body.material, law.rebound_bound(bound)):
         value, name = mode_limit(spacing, density, mode.stiffness, mode.viscosity, inertia)
         entry = (value, mode.stiffness, mode.viscosity)
         smallest[name] = min(smallest.get(name, entry), entry)

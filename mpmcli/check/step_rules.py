@@ -170,7 +170,11 @@ def _impact(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
     courant = waves * damped_step(facts, body, step, shorter) / h
     if not (courant > 0 and math.isfinite(speed)):
         return
-    length, share = chord(body.body.shape.form, velocity / speed), _flat_share(body.body.shape.form, h, mach)
+    form, share = body.body.shape.form, 1.0
+    if isinstance(form, Ball):
+        # What an impact of a ball brings together, sqrt(2 h / R + 4 mach) a side.
+        share = min(1.0, (2 * h / form.radius + 4 * mach) ** ((len(form.center) - 1) / 2))
+    length = chord(form, velocity / speed)
 
     def lost(settings: SolverSettings, spacing: float) -> float:
         # Waves cross as many cells in a step with any spacing.
@@ -225,13 +229,6 @@ def chord(form: Form, direction: np.ndarray) -> float:
     # The bounding box of points ends at their centres.
     edges = np.ptp(form.bounds(), axis=0) + (form.edge if isinstance(form, Points) else 0.0)
     return float(form.volume / (np.prod(edges) * np.sum(np.abs(direction) / edges)))
-
-
-def _flat_share(form: Form, spacing: float, mach: float) -> float:
-    """Return the share that an impact of a ball brings together, sqrt(2 h / R + 4 mach) a side; 1 of other shapes."""
-    if not isinstance(form, Ball):
-        return 1.0
-    return min(1.0, (2 * spacing / form.radius + 4 * mach) ** ((len(form.center) - 1) / 2))
 
 
 def rounding_findings(facts: SceneFacts) -> Iterator[Finding]:

@@ -36,9 +36,7 @@ RESERVE = 5.0
 @click.option("--resume", is_flag=True, help="Go on with the dataset in the directory.")
 @click.option("--dry-run", is_flag=True, help="List the draws, check each scene, and forecast time and disk space.")
 @options.arch_option("Where each worker computes")
-@options.time_option(
-    "--max-time", "End the sweep before this wall time, to go on with --resume: 2h, 90m, 45s, 1h30m or 1:30:00."
-)
+@options.time_option("End the sweep before this wall time, to go on with --resume: 2h, 90m, 45s, 1h30m or 1:30:00.")
 @options.plugin_option
 @quiet_option
 @json_option
@@ -150,8 +148,7 @@ def verify(dataset: Path, quiet: bool, as_json: bool) -> int:
 @click.argument("dataset", type=PATH)
 def card(dataset: Path) -> None:
     """Write README.md of DATASET again, with the picture montage.png if `mpmcli render` has drawn it."""
-    from mpmcli.dataset.card import write_card
-    from mpmcli.dataset.report import status_of
+    from mpmcli.dataset.report import status_of, write_card
 
     status_of(dataset)
     print_text(str(write_card(dataset)))

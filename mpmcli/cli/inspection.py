@@ -1,18 +1,12 @@
 """`mpmcli check`, `mpmcli info` and `mpmcli doctor`."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
 from mpmcli.cli.options import COUNT, SCENE, json_option, plugin_option, set_option
 from mpmcli.cli.streams import print_answer, print_json, print_text
 from mpmcli.errors import InputError
-
-if TYPE_CHECKING:
-    from mpmcli.check.scene_check import SceneCheck
-    from mpmcli.dataset.report import Verification as DatasetVerification
-    from mpmcli.output.verify import Verification
 
 
 @click.command("check", epilog="Example: mpmcli check drop.toml --set domain.spacing=0.01")
@@ -23,19 +17,41 @@ if TYPE_CHECKING:
 @click.option("--strict", is_flag=True, help="Treat warnings as errors.")
 @click.option("--threads", type=COUNT, help="CPU threads; as many as simulate takes by default.")
 @json_option
-def check_command(path: Path, strict: bool, as_json: bool, **of_scene: object) -> int:
+def check_command(
+    path: Path,
+    overrides: tuple[str, ...],
+    plugins: tuple[Path, ...],
+    probe: bool,
+    strict: bool,
+    threads: int | None,
+    as_json: bool,
+) -> int:
     """Check a scene (PATH.toml): the stable step and its cause, likely faults, and the cost of the run.
 
     Or check whether a result is stable and complete: its directory or particles.vtkhdf. Nothing is
     written. The exit code is 1 if there is an error, or with --strict a warning.
     """
     if path.suffix == ".toml":
-        check = _check_scene(path, **of_scene)
+        from mpmcli.check.scene_check import check_scene
+        from mpmcli.cores import available_cores
+        from mpmcli.materials.registry import load_plugins
+        from mpmcli.scene import load_scene
+        from mpmcli.solver.machine.backend import Backend
+        from mpmcli.solver.machine.plan import make_plan
+
+        loaded = load_scene(path, overrides, laws=load_plugins(plugins))
+        backend = Backend("cpu", threads or available_cores(), loaded.scene.solver.precision, compile_cache=True)
+        check = check_scene(loaded, plan=make_plan(loaded.scene, backend), threads=threads)
+        # A scene that does not fit into memory is not run.
+        if probe and not any(finding.rule == "memory" for finding in check.findings):
+            from mpmcli.check.forecast import probe_scene
+
+            found, plan = probe_scene(loaded, check.forecast.steps, threads=threads)
+            check = check_scene(loaded, plan=plan, probe=found, threads=threads)
     else:
-        options = {"overrides": "--set", "plugins": "--plugin", "probe": "--probe", "threads": "--threads"}
-        given = [option for name, option in options.items() if of_scene[name]]
-        if given:
-            raise InputError(f"{given[0]} is for scenes, and {path} is none; leave it out.")
+        given = {"--set": overrides, "--plugin": plugins, "--probe": probe, "--threads": threads}
+        for option in (option for option, value in given.items() if value):
+            raise InputError(f"{option} is for scenes, and {path} is none; leave it out.")
         from mpmcli.check.result_check import check_result
 
         check = check_result(path)
@@ -44,28 +60,6 @@ def check_command(path: Path, strict: bool, as_json: bool, **of_scene: object) -
     else:
         print_text(check.text())
     return 0 if check.passes(strict=strict) else 1
-
-
-def _check_scene(
-    path: Path, overrides: tuple[str, ...], plugins: tuple[Path, ...], probe: bool, threads: int | None
-) -> "SceneCheck":
-    from mpmcli.check.scene_check import check_scene
-    from mpmcli.cores import available_cores
-    from mpmcli.materials.registry import load_plugins
-    from mpmcli.scene import load_scene
-    from mpmcli.solver.machine.backend import Backend
-    from mpmcli.solver.machine.plan import make_plan
-
-    loaded = load_scene(path, overrides, laws=load_plugins(plugins))
-    backend = Backend("cpu", threads or available_cores(), loaded.scene.solver.precision, compile_cache=True)
-    check = check_scene(loaded, plan=make_plan(loaded.scene, backend), threads=threads)
-    # A scene that does not fit into memory is not run.
-    if probe and not any(finding.rule == "memory" for finding in check.findings):
-        from mpmcli.check.probe import probe_scene
-
-        found, plan = probe_scene(loaded, check.forecast.steps, threads=threads)
-        check = check_scene(loaded, plan=plan, probe=found, threads=threads)
-    return check
 
 
 @click.command("info", epilog="Example: mpmcli info results/drop --verify")
@@ -84,7 +78,13 @@ def info_command(
     if verify:
         if path.suffix == ".toml" or overrides or plugins:
             raise InputError(f"--verify is for results, datasets and exports, and {path} is none; leave it out.")
-        verification = _verified(path)
+        from mpmcli.dataset.dataset import is_dataset
+        from mpmcli.dataset.export import is_export, verify_export
+        from mpmcli.dataset.report import verify as verify_dataset
+        from mpmcli.output.verify import verify_result
+
+        whole = verify_export if is_export(path) else verify_dataset if is_dataset(path) else verify_result
+        verification = whole(path)
         print_answer(verification, as_json)
         return 1 if verification.faults else 0
     if path.suffix == ".toml":
@@ -101,17 +101,6 @@ def info_command(
     width = max(len(name) for name in known)
     print_text("\n".join(f"{name.replace('_', ' '):<{width}}  {_plain(value)}" for name, value in known.items()))
     return None
-
-
-def _verified(path: Path) -> "Verification | DatasetVerification":
-    from mpmcli.dataset.dataset import is_dataset
-    from mpmcli.dataset.export import is_export, verify_export
-    from mpmcli.dataset.report import verify
-    from mpmcli.output.verify import verify_result
-
-    if is_export(path):
-        return verify_export(path)
-    return verify(path) if is_dataset(path) else verify_result(path)
 
 
 def _scene_facts(path: Path, overrides: tuple[str, ...], plugins: tuple[Path, ...]) -> dict:

@@ -5,16 +5,13 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 from shutil import copyfile
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from mpmcli.cli.options import json_option, output_option, plugin_option
 from mpmcli.cli.streams import print_json, print_note, print_text
 from mpmcli.errors import InputError
-
-if TYPE_CHECKING:
-    from rich.console import Console
 
 # Width of the text, in columns, if stdout is not a terminal.
 WIDTH = 140
@@ -71,9 +68,7 @@ def materials_command(name: str | None, plugins: tuple[Path, ...], as_json: bool
     values that they set.
     """
     from mpmcli.materials.registry import laws, load_plugins
-    from mpmcli.scene.catalogue import law_facts, preset_facts
-    from mpmcli.scene.expand import available_presets
-    from mpmcli.scene.presets import PRESETS
+    from mpmcli.scene.expand import PRESETS, available_presets, law_facts, preset_facts
     from mpmcli.scene.problem import listed, nearest, quoted
 
     models = load_plugins(plugins)
@@ -119,45 +114,35 @@ def _summary(law: type) -> str:
 
 
 def _print(facts: dict[str, list[dict[str, Any]]], in_full: bool) -> None:
-    from rich.console import Console
-
-    console = Console(highlight=False)
-    if not console.is_terminal:
-        console.width = WIDTH
     if facts["presets"] and not in_full:
-        _show(console, 'Presets: material = "honey", or { preset = "honey", thickness = 0.7, density = 1400 }')
-        _say_table(
-            console, ["preset", "law", "what it shows"], [[p["name"], p["law"], p["shows"]] for p in facts["presets"]]
-        )
-        _show(console, "\nLaws: material = { law = ..., with these parameters, or a knob in place of one }")
+        _show('Presets: material = "honey", or { preset = "honey", thickness = 0.7, density = 1400 }')
+        _say_table(["preset", "law", "what it shows"], [[p["name"], p["law"], p["shows"]] for p in facts["presets"]])
+        _show("\nLaws: material = { law = ..., with these parameters, or a knob in place of one }")
     for law in facts["laws"]:
-        _say_law(console, law)
+        _show(f"\n{law['name']}: {law['summary']}")
+        rows = [
+            [
+                p["name"],
+                p["unit"],
+                p["range"],
+                "needed" if p["default"] is None else _plain(p["default"]),
+                p["description"],
+            ]
+            for p in law["parameters"]
+        ]
+        rows += [[f"{k['name']} (knob)", "", "0 to 1", "", _knob_text(k)] for k in law["knobs"]]
+        _say_table(["parameter", "unit", "range", "default", "meaning"], rows)
+        for field in law["fields"]:
+            where = "" if len(field["dimensions"]) == 2 else f" ({field['dimensions'][0]}D only)"
+            _show(f"output field {field['name']}{where}: {field['description']}")
     for preset in facts["presets"] if in_full else []:
-        _say_preset(console, preset)
-
-
-def _say_law(console: "Console", law: dict[str, Any]) -> None:
-    _show(console, f"\n{law['name']}: {law['summary']}")
-    rows = [
-        [p["name"], p["unit"], p["range"], "needed" if p["default"] is None else _plain(p["default"]), p["description"]]
-        for p in law["parameters"]
-    ]
-    rows += [[f"{k['name']} (knob)", "", "0 to 1", "", _knob_text(k)] for k in law["knobs"]]
-    _say_table(console, ["parameter", "unit", "range", "default", "meaning"], rows)
-    for field in law["fields"]:
-        where = "" if len(field["dimensions"]) == 2 else f" ({field['dimensions'][0]}D only)"
-        _show(console, f"output field {field['name']}{where}: {field['description']}")
-
-
-def _say_preset(console: "Console", preset: dict[str, Any]) -> None:
-    _show(console, f"\npreset {preset['name']}, of the law {preset['law']}: {preset['shows']}")
-    rows = [[v["name"], _plain(v["value"]), v["unit"], v["source"]] for v in preset["values"]]
-    _say_table(console, ["parameter", "value", "unit", "source"], rows)
-    knobs = [
-        [k["name"], "" if k["position"] is None else f"{k['position']:.2g}", _knob_text(k)] for k in preset["knobs"]
-    ]
-    if knobs:
-        _say_table(console, ["knob", "position", "meaning"], knobs)
+        _show(f"\npreset {preset['name']}, of the law {preset['law']}: {preset['shows']}")
+        rows = [[v["name"], _plain(v["value"]), v["unit"], v["source"]] for v in preset["values"]]
+        _say_table(["parameter", "value", "unit", "source"], rows)
+        positions = ["" if k["position"] is None else f"{k['position']:.2g}" for k in preset["knobs"]]
+        knobs = [[k["name"], position, _knob_text(k)] for k, position in zip(preset["knobs"], positions, strict=True)]
+        if knobs:
+            _say_table(["knob", "position", "meaning"], knobs)
 
 
 def _knob_text(knob: dict[str, Any]) -> str:
@@ -171,7 +156,7 @@ def _plain(value: object) -> str:
     return f"{value:g}" if isinstance(value, float) else written(value)
 
 
-def _say_table(console: "Console", head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+def _say_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     from rich.table import Table
     from rich.text import Text
 
@@ -181,10 +166,15 @@ def _say_table(console: "Console", head: Sequence[str], rows: Sequence[Sequence[
     table.add_column(head[-1])
     for row in rows:
         table.add_row(*(Text(cell) for cell in row))
-    _show(console, table)
+    _show(table)
 
 
-def _show(console: "Console", content: object) -> None:
+def _show(content: object) -> None:
+    from rich.console import Console
+
+    console = Console(highlight=False)
+    if not console.is_terminal:
+        console.width = WIDTH
     with console.capture() as captured:
         console.print(content, markup=False)
     # Tables are padded to the full width.

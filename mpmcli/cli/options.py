@@ -69,9 +69,9 @@ def arch_option(what: str) -> Callable:
     return choice_option("--arch", ["auto", "cpu", "cuda", "vulkan", "metal"], "auto", text)
 
 
-def time_option(flag: str, text: str) -> Callable:
-    """Return an option that takes a wall time."""
-    return click.option(flag, type=duration, metavar="TIME", help=text)
+def time_option(text: str) -> Callable:
+    """Return the option for the wall time after which a command ends."""
+    return click.option("--max-time", type=duration, metavar="TIME", help=text)
 
 
 def duration(text: str) -> float:

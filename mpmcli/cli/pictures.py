@@ -88,8 +88,8 @@ def render_command(result: Path, workers: int | None, quiet: bool, as_json: bool
     from mpmcli.materials.registry import parameter_models
     from mpmcli.output import open_result
     from mpmcli.plain_text import counted
+    from mpmcli.render.render_scene import result_of_start
     from mpmcli.render.request import Request, plan_render
-    from mpmcli.render.scene_start import result_of_start
     from mpmcli.scene import load_scene
 
     # Without a home directory it warns about its cache.
@@ -139,8 +139,7 @@ def plot_command(
     largest speed, and how far the particles reach.
     """
     from mpmcli.output import open_result
-    from mpmcli.plot.history import read_history
-    from mpmcli.plot.ledger_figure import ledger_picture
+    from mpmcli.plot.ledger_figure import ledger_picture, read_history
     from mpmcli.render.picture_file import digest_of, settings_digest, write_picture
 
     # Without a home directory it warns about its cache.

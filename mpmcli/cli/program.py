@@ -30,7 +30,7 @@ COMMANDS = {
     "materials": ("materials", "List laws, presets, their parameters and knobs."),
     "schema": ("materials", "Print the JSON Schema of scenes, for editors."),
     "validate": ("validate", "Measure speed against error on problems with known answers."),
-    "bench": ("bench", "Compare speed with the MPM examples that Taichi ships."),
+    "bench": ("validate", "Compare speed with the MPM examples that Taichi ships."),
     "doctor": ("inspection", "Say whether everything that mpmcli needs works here."),
     "completion": ("program", "Print the script that completes commands in a shell."),
 }
@@ -110,7 +110,10 @@ def run(arguments: list[str]) -> int:
         result = program.main(arguments, prog_name="mpmcli", standalone_mode=False)
         return result if isinstance(result, int) else 0
     except click.ClickException as error:
-        print_error(f"error: {_usage_sentence(error)}")
+        said = error.format_message()
+        said = said[:1].lower() + said[1:] + ("" if said.endswith((".", "?")) else ".")
+        context = getattr(error, "ctx", None)
+        print_error(f"error: {said}" + (f" See {context.command_path} --help." if context else ""))
         return 2
     except (click.Abort, KeyboardInterrupt):
         print_error("interrupted")
@@ -150,10 +153,3 @@ def _directory_is_gone() -> bool:
     except FileNotFoundError:
         return True
     return False
-
-
-def _usage_sentence(error: click.ClickException) -> str:
-    message = error.format_message()
-    message = message[:1].lower() + message[1:] + ("" if message.endswith((".", "?")) else ".")
-    context = getattr(error, "ctx", None)
-    return message if context is None else f"{message} See {context.command_path} --help."

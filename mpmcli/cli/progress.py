@@ -2,13 +2,11 @@
 
 import time
 from collections.abc import Sequence
-from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from mpmcli.cli.streams import print_error
 from mpmcli.plain_text import counted
 
 if TYPE_CHECKING:
@@ -52,9 +50,7 @@ class ProgressBar:
             self._bar.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self.drawn:
             self._bar.stop()
 
@@ -67,12 +63,12 @@ class ProgressBar:
             said = text + more
             self.say(f"{done}/{self._total} {self._unit}" + (f": {said}" if said else ""))
 
-    def say(self, line: str, *, whole: bool = False) -> None:
-        """Print a line; a terminal gets it broken between words, unless it is to be copied `whole`."""
+    def say(self, line: str) -> None:
+        """Print a line; a terminal gets it broken between words."""
         if self._quiet:
             return
         try:
-            self._console.print(line, markup=False, highlight=False, soft_wrap=whole or not self._console.is_terminal)
+            self._console.print(line, markup=False, highlight=False, soft_wrap=not self._console.is_terminal)
         except (OSError, SystemExit):
             # stderr is closed (rich exits on a broken pipe). The work continues.
             self._quiet = True
@@ -120,11 +116,6 @@ class SimulateProgress(ProgressBar):
             f"t = {row.time:.4g} of {self._end:.4g} s, {summary.rate / 1e6:.1f} M particle-steps/s",
             f", step {row.step_min:.3g} s ({row.limit}), {left:.0f} s left",
         )
-
-    def close(self, summary: "RunSummary") -> None:
-        """Print why the run ended early, even when quiet."""
-        if summary.message:
-            print_error(f"error: {summary.message}")
 
 
 class ValidateProgress(ProgressBar):

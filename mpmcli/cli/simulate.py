@@ -10,7 +10,7 @@ import click
 from mpmcli.cli import options
 from mpmcli.cli.interrupt import interrupt_came, interrupted_code, interrupts_wait
 from mpmcli.cli.options import COUNT, SCENE, json_option, quiet_option
-from mpmcli.cli.streams import print_answer, print_json, print_note, print_text
+from mpmcli.cli.streams import print_answer, print_error, print_json, print_note, print_text
 from mpmcli.cli.supervisor import announce
 from mpmcli.errors import InputError
 
@@ -39,9 +39,7 @@ from mpmcli.errors import InputError
 @click.option(
     "--force", is_flag=True, help="Run although `mpmcli check` finds errors, and take time.step above the stable step."
 )
-@options.time_option(
-    "--max-time", "End the run, with the result packed, before this wall time: 2h, 90m, 45s, 1h30m or 1:30:00."
-)
+@options.time_option("End the run, with the result packed, before this wall time: 2h, 90m, 45s, 1h30m or 1:30:00.")
 @click.option(
     "--max-memory",
     type=options.size,
@@ -58,7 +56,7 @@ def simulate_command(scene: Path, precision: str | None, quiet: bool, as_json: b
     from mpmcli.cli.progress import SimulateProgress
     from mpmcli.materials.registry import load_plugins
     from mpmcli.scene import load_scene
-    from mpmcli.simulation.limits import Limits
+    from mpmcli.simulation.settings import Limits
     from mpmcli.simulation.simulate import RunSettings, simulate
 
     if run["resume"] and run["overwrite"]:
@@ -74,7 +72,8 @@ def simulate_command(scene: Path, precision: str | None, quiet: bool, as_json: b
     progress = SimulateProgress(loaded.scene.time.end, loaded.scene.time.frames + 1, quiet=quiet)
     with progress, interrupts_wait():
         summary = simulate(loaded, settings, progress.start, progress.advance, interrupt_came)
-    progress.close(summary)
+    if summary.message:
+        print_error(f"error: {summary.message}")
     if summary.status in ("interrupted", "stopped") and summary.frames:
         again = [word for word in sys.argv[1:] if word not in ("--overwrite", "--resume")]
         print_note(f"To go on: {shlex.join(['mpmcli', *again, '--resume'])}")
@@ -97,8 +96,7 @@ def warm_command(scenes: tuple[Path, ...], arch: str, threads: int | None, jobs:
     from mpmcli.cores import available_cores
     from mpmcli.materials.registry import parameter_models
     from mpmcli.scene import load_scene
-    from mpmcli.simulation.engine import backend_for
-    from mpmcli.simulation.warm import warm
+    from mpmcli.simulation.engine import backend_for, warm
 
     for path in scenes:
         backend_for(load_scene(path, laws=parameter_models()).scene, arch, threads)

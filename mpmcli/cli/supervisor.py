@@ -41,6 +41,7 @@ def may_supervise(arguments: Sequence[str]) -> bool:
 
 def supervise(work: Callable[[], int]) -> int:
     """Do work in a child process and return its exit code; a signal that kills the child kills this process too."""
+    global _announced
     # Ignored ones, as in `mpmcli ... &` or under nohup, stay ignored.
     requests = {
         getattr(signal, name) for name in REQUESTS if signal.getsignal(getattr(signal, name)) is not signal.SIG_IGN
@@ -52,7 +53,15 @@ def supervise(work: Callable[[], int]) -> int:
     child = os.fork()
     if not child:
         os.close(told)
-        _begin_child(us, tells)
+        _announced = tells
+        # Ctrl-C at the terminal goes to the supervisor alone.
+        with suppress(OSError):
+            os.setpgid(0, 0)
+        if sys.platform == "linux":
+            with suppress(OSError, AttributeError):
+                ctypes.CDLL(None).prctl(DEATH_SIGNAL, signal.SIGKILL)
+            if os.getppid() != us:
+                os._exit(1)
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
         code = work()
         flush_streams()
@@ -74,19 +83,6 @@ def announce(directory: Path) -> None:
     os.write(_announced, json.dumps({"directory": str(place), "made": made[::-1]}).encode() + b"\n")
 
 
-def _begin_child(parent: int, tells: int) -> None:
-    global _announced
-    _announced = tells
-    # Ctrl-C at the terminal goes to the supervisor alone.
-    with suppress(OSError):
-        os.setpgid(0, 0)
-    if sys.platform == "linux":
-        with suppress(OSError, AttributeError):
-            ctypes.CDLL(None).prctl(DEATH_SIGNAL, signal.SIGKILL)
-        if os.getppid() != parent:
-            os._exit(1)
-
-
 def _attend(child: int, requests: set[signal.Signals], watched: set[signal.Signals], told: int) -> int:
     """Pass signals on until the child has ended."""
     first: signal.Signals | None = None
@@ -105,10 +101,17 @@ def _attend(child: int, requests: set[signal.Signals], watched: set[signal.Signa
             ready = True
             continue
         if came is None:
-            _kill_tree(child)
+            import psutil
+
+            with suppress(psutil.Error):
+                process = psutil.Process(child)
+                # Stopped, it starts no more.
+                process.suspend()
+                for one in [*process.children(recursive=True), process]:
+                    with suppress(psutil.Error):
+                        one.kill()
             os.waitpid(child, 0)
-            _close_result(child, told, first)
-            return _interrupted(first)
+            return _interrupted(child, told, first)
         number = signal.Signals(came.si_signo)
         if number in requests:
             with suppress(ProcessLookupError):
@@ -117,41 +120,19 @@ def _attend(child: int, requests: set[signal.Signals], watched: set[signal.Signa
             deadline = min(time.monotonic() + wait, deadline or float("inf"))
             first = first or number
         elif number == signal.SIGTSTP:
-            _pause(child)
+            # Stop with the child, as Ctrl-Z asks, until this process is continued.
+            with suppress(ProcessLookupError):
+                os.killpg(child, signal.SIGSTOP)
+            os.kill(os.getpid(), signal.SIGSTOP)
+            with suppress(ProcessLookupError):
+                os.killpg(child, signal.SIGCONT)
         else:
             ended, status = os.waitpid(child, os.WNOHANG)
             if ended and first is not None and os.WIFSIGNALED(status):
                 # It came where Python is not ready for it, as at its end.
-                _close_result(child, told, first)
-                return _interrupted(first)
+                return _interrupted(child, told, first)
             if ended:
                 return _code(status)
-
-
-def _interrupted(first: signal.Signals) -> int:
-    print_error("interrupted")
-    return INTERRUPTED if first == signal.SIGINT else TERMINATED
-
-
-def _kill_tree(child: int) -> None:
-    import psutil
-
-    with suppress(psutil.Error):
-        process = psutil.Process(child)
-        # Stopped, it starts no more.
-        process.suspend()
-        for one in [*process.children(recursive=True), process]:
-            with suppress(psutil.Error):
-                one.kill()
-
-
-def _pause(child: int) -> None:
-    """Stop with the child, as Ctrl-Z asks, until this process is continued."""
-    with suppress(ProcessLookupError):
-        os.killpg(child, signal.SIGSTOP)
-    os.kill(os.getpid(), signal.SIGSTOP)
-    with suppress(ProcessLookupError):
-        os.killpg(child, signal.SIGCONT)
 
 
 def _code(status: int) -> int:
@@ -171,18 +152,16 @@ def _code(status: int) -> int:
     return 1
 
 
-def _close_result(child: int, told: int, first: signal.Signals) -> None:
+def _interrupted(child: int, told: int, first: signal.Signals) -> int:
     """Write into run.json how the run ended that the child was writing, or remove it where it has no frame."""
-    os.set_blocking(told, False)
-    try:
-        lines = os.read(told, 2**20).splitlines()
-    except OSError:
-        return
-    if not lines:
-        return
     from mpmcli.errors import MpmcliError
-    from mpmcli.output.directory import close_abandoned
 
-    facts = json.loads(lines[-1])
+    os.set_blocking(told, False)
     with suppress(MpmcliError, OSError):
-        close_abandoned(Path(facts["directory"]), [Path(path) for path in facts["made"]], child, first.name)
+        if lines := os.read(told, 2**20).splitlines():
+            from mpmcli.output.directory import close_abandoned
+
+            facts = json.loads(lines[-1])
+            close_abandoned(Path(facts["directory"]), [Path(path) for path in facts["made"]], child, first.name)
+    print_error("interrupted")
+    return INTERRUPTED if first == signal.SIGINT else TERMINATED

@@ -6,11 +6,12 @@ import logging
 import os
 import queue
 import signal
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
@@ -22,15 +23,14 @@ from mpmcli.check.scene_check import check_scene
 from mpmcli.dataset.draw import Draw, draw
 from mpmcli.dataset.folder import Row
 from mpmcli.dataset.shard import LABELS, MOVING, PENDING, QUARANTINE, TrajectoryData, file_name, write_single
-from mpmcli.dataset.sources import require_same_sources
 from mpmcli.dataset.sweep import Sweep
 from mpmcli.errors import InputError, RunError
 from mpmcli.materials.registry import load_plugins
-from mpmcli.processes.interrupts import interrupts_blocked
+from mpmcli.output.checksums import path_digest
+from mpmcli.processes.pool import interrupts_blocked
 from mpmcli.scene import LoadedScene, Scene, scene_to_toml
 from mpmcli.simulation.engine import Arch
-from mpmcli.simulation.recording import Recording
-from mpmcli.simulation.runner import Runner
+from mpmcli.simulation.runner import Recording, Runner
 
 if TYPE_CHECKING:
     from distributed import LocalCluster
@@ -88,7 +88,13 @@ def _runner(task: Task) -> Runner:
     """Return the runner of this process, whose kernels outlive a task."""
     known = (task.sweep.key, task.arch, task.threads, task.plugins, task.sources)
     if getattr(_kept, "known", None) != known:
-        require_same_sources(task.sources)
+        for path, digest in task.sources:
+            if not path.is_file() or path_digest(path) != digest:
+                what = "another" if path.is_file() else "no"
+                raise InputError(
+                    f"{path}: a worker on {socket.gethostname()} finds {what} file there than the sweep has; let all "
+                    "workers see the same files."
+                )
         _kept.laws = load_plugins(task.plugins)
         _kept.runner = Runner(task.arch, task.threads)
         scenes = []
@@ -271,16 +277,11 @@ class Workers:
 @contextmanager
 def local_workers(count: int) -> Iterator[Workers]:
     """Start workers on this machine, one process each, that end with the block."""
-    import dask
     from distributed import Client
 
-    _silence_dask()
-    with ExitStack() as stack:
-        stack.enter_context(dask.config.set(_SETTINGS))
-        cluster = stack.enter_context(_local_cluster(count))
-        workers = Workers(stack.enter_context(Client(cluster)))
+    with _quiet_dask(), _local_cluster(count) as cluster, Client(cluster) as client:
         try:
-            yield workers
+            yield Workers(client)
         except BaseException:
             # A worker hears of nothing while a kernel runs; what it writes is whole or absent.
             for nanny in cluster.workers.values():
@@ -290,11 +291,16 @@ def local_workers(count: int) -> Iterator[Workers]:
             raise
 
 
-def _silence_dask() -> None:
+@contextmanager
+def _quiet_dask() -> Iterator[None]:
     """Let Dask say nothing: a connection that is closed has a traceback, even after the cluster has ended."""
+    import dask
+
     for name in ("distributed", "distributed.client"):
         for handler in logging.getLogger(name).handlers:
             handler.setLevel(logging.CRITICAL)
+    with dask.config.set(_SETTINGS):
+        yield
 
 
 def _local_cluster(count: int) -> "LocalCluster":
@@ -322,17 +328,15 @@ def _local_cluster(count: int) -> "LocalCluster":
 @contextmanager
 def joined_workers(address: str) -> Iterator[Workers]:
     """Use the workers of a running scheduler; they see the dataset at the same path."""
-    import dask
     from distributed import Client
 
-    _silence_dask()
-    with ExitStack() as stack:
-        stack.enter_context(dask.config.set(_SETTINGS))
+    with _quiet_dask():
         try:
-            client = stack.enter_context(Client(address, timeout=10))
+            client = Client(address, timeout=10)
         except (OSError, ValueError) as error:
             raise InputError(f"--scheduler {address}: no scheduler answers there; give tcp://HOST:PORT.") from error
-        workers = Workers(client)
-        if workers.count == 0:
-            raise InputError(f"--scheduler {address}: this scheduler has no worker; start dask worker {address}.")
-        yield workers
+        with client:
+            workers = Workers(client)
+            if workers.count == 0:
+                raise InputError(f"--scheduler {address}: this scheduler has no worker; start dask worker {address}.")
+            yield workers

@@ -2,33 +2,20 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mpmcli.dataset.shard import (
-    LABELS,
-    MOVING,
-    SHARDS,
-    SPLITS,
-    SWEEP,
-    TABLES,
-    StoredGroup,
-    moving_names,
-    open_shard,
-    shard_splits,
-)
+from mpmcli.dataset.shard import LABELS, MOVING, SHARDS, SPLITS, SWEEP, TABLES, StoredGroup, moving_names, open_shard
 from mpmcli.errors import InputError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output import Result, open_result
 from mpmcli.output.collider_files import as_they_moved
 from mpmcli.output.header import RunHeader
-from mpmcli.output.layout import FrameLayout
+from mpmcli.output.layout import PACKED, SEGMENTS, FrameLayout
 from mpmcli.output.run_record import RECORD
-from mpmcli.output.segments import PACKED, SEGMENTS
 from mpmcli.scene.colliders import Collider
 
 Particles = slice | np.ndarray
@@ -164,7 +151,15 @@ class _ResultTrajectory(Trajectory):
                 f"{result.path} has frames of {counts.min()} to {counts.max()} particles: "
                 "a trajectory has the same ones in all frames."
             )
-        _require_no_gap(result)
+        if result.kind == "segments":
+            told = (result.record or {}).get("frames_written")
+            written = told if isinstance(told, int) else 0
+            # A run that goes on may have sealed some after they were listed.
+            count = result.frame_count if result.frame_count >= written else open_result(result.path).frame_count
+            if not np.array_equal(result.numbers, np.arange(len(result.numbers))) or count < written:
+                raise InputError(
+                    f"{result.path} lacks some of its frames: mpmcli simulate --resume computes them again."
+                )
         self._result = result
         self.number, self.split, self.draws = 0, SPLITS[0], {}
         self.header = result.header
@@ -192,18 +187,6 @@ class _ResultTrajectory(Trajectory):
             return array(0)
         chosen = range(self.frame_count)[frames]
         return np.stack([array(k) for k in chosen]) if chosen else array(0)[None][:0]
-
-
-def _require_no_gap(result: Result) -> None:
-    """Refuse the segments of a run of which some are missing, and would be read as if time had jumped."""
-    if result.kind != "segments":
-        return
-    told = (result.record or {}).get("frames_written")
-    written = told if isinstance(told, int) else 0
-    # A run that goes on may have sealed some after they were listed.
-    count = result.frame_count if result.frame_count >= written else open_result(result.path).frame_count
-    if not np.array_equal(result.numbers, np.arange(len(result.numbers))) or count < written:
-        raise InputError(f"{result.path} lacks some of its frames: mpmcli simulate --resume computes them again.")
 
 
 class Dataset:
@@ -240,11 +223,6 @@ class Dataset:
             return _ResultTrajectory(self._source)
         return _StoredTrajectory(self._source[number], number)
 
-    @cached_property
-    def dimension(self) -> int:
-        """2 or 3, that of the first trajectory."""
-        return self[self.numbers[0]].header.dimension
-
 
 def is_dataset(path: Path) -> bool:
     """Return whether a directory holds the shards of a dataset."""
@@ -275,7 +253,8 @@ def open_dataset(path: Path | str) -> Dataset:
     splits: dict[int, str] = {}
     places: dict[int, Path] = {}
     for shard in sorted((path / SHARDS).glob("*.h5")):
-        found = shard_splits(shard)
+        with open_shard(shard) as file:
+            found = {int(group.attrs["number"]): str(group.attrs["split"]) for group in file.values()}
         if twice := places.keys() & found.keys():
             both = f"{places[min(twice)]} and in {shard}"
             raise InputError(f"trajectory {min(twice)} lies in {both}: remove one of them.")

@@ -12,12 +12,13 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from mpmcli.dataset.sweep import Placement, Sweep, TrajectoryValues, generator
+from mpmcli.dataset.sweep import Sweep, TrajectoryValues, generator
 from mpmcli.errors import InputError
 from mpmcli.scene import LoadedScene, parse_scene
 from mpmcli.scene.colliders import Collider, Plane
 from mpmcli.scene.entry import definitions
 from mpmcli.scene.expand import Laws
+from mpmcli.scene.primitives import box_corners
 from mpmcli.scene.problem import Path as KeyPath
 from mpmcli.scene.quantity import dimension_of
 from mpmcli.scene.shapes import Ball, BodyShape, Form
@@ -70,14 +71,8 @@ class NoPlace(Exception):  # noqa: N818
 
 def room_before(centers: np.ndarray, half: np.ndarray, radius: float, wall: Distance) -> np.ndarray:
     """Return how far a rounded box at each of m centres (m, d) is from a wall, (m,), m: exact for convex room."""
-    corners = _corners(-half, half)
+    corners = box_corners(-half, half)
     return np.min([wall(centers + corner) for corner in np.unique(corners, axis=0)], axis=0) - radius
-
-
-def _corners(lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """Return the corners of a box, (2^d, d)."""
-    d = len(lower)
-    return np.array([[upper[a] if k >> a & 1 else lower[a] for a in range(d)] for k in range(2**d)])
 
 
 def _box(lower: np.ndarray, upper: np.ndarray) -> RoundedBox:
@@ -187,7 +182,11 @@ def place_bodies(values: TrajectoryValues, data: dict[str, Any]) -> list[list[di
             if distribution is not None:
                 stream = f"{place.key}.{k}.{name}" + (f".{round_number}" if round_number else "")
                 extent = values.value(f"{place.key}.{name}", stream, distribution)
-            wanted.append(_wanted(place, extent, numbers))
+            lower, upper = np.array(place.region.min), np.array(place.region.max)
+            d, is_box = len(lower), isinstance(extent, list)
+            half, radius = (np.array(extent, float) / 2, 0.0) if is_box else (np.zeros(d), float(extent))
+            volume = math.prod((2 * half).tolist()) if is_box else [math.pi, 4 / 3 * math.pi][d - 2] * radius**d
+            wanted.append(Wanted(half, radius, volume, lower, upper, place.min_distance, numbers))
         try:
             centers = find_places(wanted, obstacles, walls)
             break
@@ -198,12 +197,27 @@ def place_bodies(values: TrajectoryValues, data: dict[str, Any]) -> list[list[di
         assert farthest is not None
         index, placed, wanted = farthest
         there = [body for body, (of, _) in zip(wanted, chosen, strict=True) if of == index]
-        sentence = _crowded(placements[index], there, placed, len(wanted))
-        raise PlacementError(str(values.sweep.path), index, f"trajectory {values.number}: {sentence}")
+        place = placements[index]
+        fill = sum(body.volume for body in there) / math.prod((there[0].upper - there[0].lower).tolist())
+        measure = "area" if len(place.region.min) == 2 else "volume"
+        raise PlacementError(
+            str(values.sweep.path),
+            index,
+            f"trajectory {values.number}: at most {placed} of {len(wanted)} {place.list} found a place in "
+            f'{ROUNDS * STARTS} starts of {TRIES} tries each; "{place.template}" takes {100 * fill:.3g} percent of the '
+            f"{measure} of its region; place fewer or smaller {place.list}, with a smaller min_distance, or in a "
+            "larger region",
+        )
     result: list[list[dict[str, Any]]] = [[] for _ in placements]
     for (index, k), want, center in zip(chosen, wanted, centers, strict=True):
         place = placements[index]
-        body = {"name": f"{place.template}_{k}", **_shape_values(want, center)}
+        body: dict[str, Any] = {"name": f"{place.template}_{k}"}
+        if want.radius:
+            body |= {"center": center.tolist(), "radius": want.radius}
+        else:
+            # Round-off may carry a face out of the region.
+            lower, upper = (np.clip(center + side * want.half, want.lower, want.upper) for side in (-1, 1))
+            body |= {"min": lower.tolist(), "max": upper.tolist()}
         if place.velocity is not None:
             key = place.key
             body["velocity"] = copy.deepcopy(values.value(f"{key}.velocity", f"{key}.{k}.velocity", place.velocity))
@@ -216,22 +230,6 @@ def template_extent(shape: dict[str, Any]) -> Any:
     if "ball" in shape:
         return shape["ball"]["radius"]
     return [high - low for low, high in zip(shape["box"]["min"], shape["box"]["max"], strict=True)]
-
-
-def _wanted(place: Placement, extent: Any, generator: np.random.Generator) -> Wanted:
-    lower, upper = np.array(place.region.min), np.array(place.region.max)
-    d, is_box = len(lower), isinstance(extent, list)
-    half, radius = (np.array(extent, float) / 2, 0.0) if is_box else (np.zeros(d), float(extent))
-    volume = math.prod((2 * half).tolist()) if is_box else [math.pi, 4 / 3 * math.pi][d - 2] * radius**d
-    return Wanted(half, radius, volume, lower, upper, place.min_distance, generator)
-
-
-def _shape_values(want: Wanted, center: np.ndarray) -> dict[str, Any]:
-    if want.radius:
-        return {"center": center.tolist(), "radius": want.radius}
-    # Round-off may carry a face out of the region.
-    lower, upper = (np.clip(center + side * want.half, want.lower, want.upper) for side in (-1, 1))
-    return {"min": lower.tolist(), "max": upper.tolist()}
 
 
 def _obstacles(
@@ -258,20 +256,9 @@ def _obstacles(
                     walls.append(collider.signed_distance)
                 else:
                     # A box with faces along the axes, about the bounding box at time 0.
-                    placed = collider.motion.placed(_corners(*collider.form.bounds()), 0.0)
+                    placed = collider.motion.placed(box_corners(*collider.form.bounds()), 0.0)
                     boxes.append(_box(placed.min(axis=0), placed.max(axis=0)))
     return boxes, walls
-
-
-def _crowded(place: Placement, there: list[Wanted], placed: int, total: int) -> str:
-    """Say how far the placement came, and how full the region would be."""
-    fill = sum(body.volume for body in there) / math.prod((there[0].upper - there[0].lower).tolist())
-    measure = "area" if len(place.region.min) == 2 else "volume"
-    return (
-        f"at most {placed} of {total} {place.list} found a place in {ROUNDS * STARTS} starts of {TRIES} tries each; "
-        f'"{place.template}" takes {100 * fill:.3g} percent of the {measure} of its region; '
-        f"place fewer or smaller {place.list}, with a smaller min_distance, or in a larger region"
-    )
 
 
 @dataclass(frozen=True, eq=False)

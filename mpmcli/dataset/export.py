@@ -17,7 +17,7 @@ from mpmcli.dataset.formats import FORMATS
 from mpmcli.dataset.metadata import EXPORTED_BY, common_facts
 from mpmcli.dataset.report import status_of
 from mpmcli.dataset.shard import SPLITS
-from mpmcli.dataset.thinned import SEED, ThinnedTrajectory, Walls
+from mpmcli.dataset.subsample import SEED, SubsampledTrajectory, Walls
 from mpmcli.errors import InputError, RunError
 from mpmcli.output import check_directory
 from mpmcli.output.checksums import SUMS, path_digest, sums_faults, sums_text
@@ -69,9 +69,8 @@ class ExportSummary:
         """Return it as a line of text."""
         count = sum(self.trajectories.values())
         splits = ", ".join(f"{split} {number}" for split, number in self.trajectories.items() if number)
-        noun = "trajectory" if count == 1 else "trajectories"
         return (
-            f"{self.directory}: {count} {noun} ({splits}) of up to {counted(self.frames, 'frame')} and "
+            f"{self.directory}: {counted(count, 'trajectory')} ({splits}) of up to {counted(self.frames, 'frame')} and "
             f"{counted(self.particles, 'particle')}, {size_text(self.bytes)} as {self.form}"
         )
 
@@ -88,7 +87,7 @@ def export(
     check_export_directory(directory, settings.overwrite)
     numbers: Sequence[int] = dataset.numbers if settings.trajectory is None else [settings.trajectory]
     options = (settings.stride, settings.max_particles, settings.walls, settings.wall_spacing)
-    chosen = [ThinnedTrajectory(dataset[number], *options) for number in numbers]
+    chosen = [SubsampledTrajectory(dataset[number], *options) for number in numbers]
     for each in chosen:
         if each.particle_count == 0 or each.frame_count == 0:
             raise InputError(f"trajectory {each.source.number} of {dataset.path} is empty: there is nothing to export.")

@@ -20,7 +20,7 @@ from mpmcli.dataset.metadata import (
     require_alike,
 )
 from mpmcli.dataset.shard import LABELS, MOVING, SPLITS, group_name
-from mpmcli.dataset.thinned import KINDS, ThinnedTrajectory
+from mpmcli.dataset.subsample import KINDS, SubsampledTrajectory
 from mpmcli.errors import InputError
 from mpmcli.frames.ledger import RIGID
 from mpmcli.output.durable import ask_for
@@ -34,7 +34,7 @@ Written = tuple[dict[str, Any], list[str]]
 class Format(ABC):
     """Trajectories of the same dimension as files of a format."""
 
-    def __init__(self, trajectories: Sequence[ThinnedTrajectory]) -> None:
+    def __init__(self, trajectories: Sequence[SubsampledTrajectory]) -> None:
         self.trajectories = trajectories
 
     def check(self) -> None:  # noqa: B027
@@ -66,13 +66,13 @@ class TrainingFormat(Format):
         """Return what no other format says."""
 
     @abstractmethod
-    def write_split(self, path: Path, chosen: Sequence[ThinnedTrajectory], tick: Callable[[], None]) -> None:
+    def write_split(self, path: Path, chosen: Sequence[SubsampledTrajectory], tick: Callable[[], None]) -> None:
         """Write the file of a split."""
 
     def size(self) -> int:
         return sum(map(self._bytes, self.trajectories))
 
-    def _bytes(self, trajectory: ThinnedTrajectory) -> int:
+    def _bytes(self, trajectory: SubsampledTrajectory) -> int:
         position = 4 * trajectory.layout.dimension * trajectory.frame_count
         return trajectory.whole_count * (position + 8 + 8 * len(self.parameters))
 
@@ -118,7 +118,7 @@ class TrainingFormat(Format):
         known = {name: getattr(self, name) for name in KINDS if name in found}
         return {"wall" if number == self.wall else name: number for name, number in known.items()}
 
-    def particle_types(self, trajectory: ThinnedTrajectory) -> np.ndarray:
+    def particle_types(self, trajectory: SubsampledTrajectory) -> np.ndarray:
         """Return the type of each particle, and then of each on walls, (N + W,) int64."""
         laws = np.array([self.types[law.name] for law in trajectory.source.header.laws], np.int64)
         walls = np.array([getattr(self, name) for name in KINDS], np.int64)[trajectory.walls.kinds]
@@ -185,32 +185,27 @@ class LagrangeBench(TrainingFormat):
         lengths = {"sequence_length_train": length, "sequence_length_test": length}
         return {"solver": "MPM", "case": first.source.header.title, **lengths, **place}, notes
 
-    def write_split(self, path: Path, chosen: Sequence[ThinnedTrajectory], tick: Callable[[], None]) -> None:
+    def write_split(self, path: Path, chosen: Sequence[SubsampledTrajectory], tick: Callable[[], None]) -> None:
         ask_for(path, sum(map(self._bytes, chosen)))
         with h5py.File(path, "w") as file:
             for k, each in enumerate(chosen):
                 self._write_trajectory(file.create_group(f"{k:05d}"), each)
                 tick()
 
-    def _write_trajectory(self, group: h5py.Group, trajectory: ThinnedTrajectory) -> None:
+    def _write_trajectory(self, group: h5py.Group, trajectory: SubsampledTrajectory) -> None:
         # The layout of the file depends on when its objects are closed: here, before the next group is made.
         shape = (trajectory.frame_count, trajectory.whole_count, trajectory.layout.dimension)
         # Loaders read windows of some frames: a chunk is one.
         position = group.create_dataset("position", shape, np.float32, chunks=(1, *shape[1:]), compression="gzip")
-        first = 0
+        first, (lower, extent, _) = 0, self._box
+        periodic = self.trajectories[0].source.header.periodic
         for block in trajectory.whole_blocks():
-            position[first : first + len(block)] = self._placed(block)
+            placed = block.astype(np.float64) - lower
+            placed = np.where(periodic, np.mod(placed, extent), placed)
+            # A place on an upper face lies below it, by a few roundings of the quotient by which a cell is found.
+            position[first : first + len(block)] = np.clip(placed, 0.0, extent * (1 - 2.0**-20)).astype(np.float32)
             first += len(block)
         group.create_dataset("particle_type", data=self.particle_types(trajectory))
-
-    def _placed(self, positions: np.ndarray) -> np.ndarray:
-        """Return positions (t, n, d) from the lower corner on, m float32: a place on an upper face lies below it."""
-        lower, extent, _ = self._box
-        placed = positions.astype(np.float64) - lower
-        periodic = self.trajectories[0].source.header.periodic
-        placed = np.where(periodic, np.mod(placed, extent), placed)
-        # By a few roundings of the quotient by which a cell is found.
-        return np.clip(placed, 0.0, extent * (1 - 2.0**-20)).astype(np.float32)
 
 
 class Gns(TrainingFormat):
@@ -268,35 +263,32 @@ class Gns(TrainingFormat):
             "material_feature_max": np.max(values, axis=0).tolist(),
         }, notes if len(names) > 1 else []
 
-    def _parameters_of_bodies(self, trajectory: ThinnedTrajectory) -> np.ndarray:
+    def _parameters_of_bodies(self, trajectory: SubsampledTrajectory) -> np.ndarray:
         """Return the parameters of each body, (bodies, m), in the units of scenes; 0 where a law has no such one."""
         bodies = trajectory.source.header.bodies
         rows = [[body.material.get(name, 0.0) for name in self.parameters] for body in bodies]
         numbers = [[float(value) if isinstance(value, int | float) else 0.0 for value in row] for row in rows]
         return np.array(numbers).reshape(len(bodies), len(self.parameters))
 
-    def write_split(self, path: Path, chosen: Sequence[ThinnedTrajectory], tick: Callable[[], None]) -> None:
+    def write_split(self, path: Path, chosen: Sequence[SubsampledTrajectory], tick: Callable[[], None]) -> None:
         def entries() -> Iterable[tuple[str, np.ndarray]]:
+            m = len(self.parameters)
             for each in chosen:
-                yield f"trajectory_{each.source.number:06d}", self._entry(each)
+                positions = np.concatenate([block.astype(np.float32) for block in each.whole_blocks()])
+                parts = [positions, self.particle_types(each)]
+                if m:
+                    # The loader broadcasts a single one to (N,), which it could not do with (N, 1).
+                    properties = self._parameters_of_bodies(each)[each.label("body")]
+                    properties = np.concatenate([properties, np.zeros((each.walls.count, m))])
+                    parts.append(properties[:, 0] if m == 1 else properties)
+                # From a tuple of arrays numpy would try to make one array of numbers, and fail.
+                entry = np.empty(len(parts), object)
+                for k, part in enumerate(parts):
+                    entry[k] = part
+                yield f"trajectory_{each.source.number:06d}", entry
                 tick()
 
         write_npz(path, entries())
-
-    def _entry(self, trajectory: ThinnedTrajectory) -> np.ndarray:
-        positions = np.concatenate([block.astype(np.float32) for block in trajectory.whole_blocks()])
-        parts = [positions, self.particle_types(trajectory)]
-        m = len(self.parameters)
-        if m:
-            # The loader broadcasts a single one to (N,), which it could not do with (N, 1).
-            properties = self._parameters_of_bodies(trajectory)[trajectory.label("body")]
-            properties = np.concatenate([properties, np.zeros((trajectory.walls.count, m))])
-            parts.append(properties[:, 0] if m == 1 else properties)
-        # From a tuple of arrays numpy would try to make one array of numbers, and fail.
-        entry = np.empty(len(parts), object)
-        for k, part in enumerate(parts):
-            entry[k] = part
-        return entry
 
 
 class Npz(Format):
@@ -328,7 +320,7 @@ class Npz(Format):
         return facts | statistics, notes
 
     @staticmethod
-    def _arrays(trajectory: ThinnedTrajectory) -> Iterable[tuple[str, np.ndarray]]:
+    def _arrays(trajectory: SubsampledTrajectory) -> Iterable[tuple[str, np.ndarray]]:
         rows = trajectory.ledger()
         for name in (*MOVING, *trajectory.source.field_names):
             yield name, trajectory.read(name)
@@ -358,7 +350,20 @@ class Vtkhdf(Format):
 
     def write(self, directory: Path, tick: Callable[[], None]) -> Written:
         for each in self.trajectories:
-            _write_vtkhdf(directory / f"{group_name(each.source.number)}.vtkhdf", each)
+            path = directory / f"{group_name(each.source.number)}.vtkhdf"
+            n, frames, layout = each.particle_count, each.frame_count, each.layout
+            # The same for all frames.
+            fixed = {name: each.label(name) for name in LABELS} | {"id": np.arange(n, dtype=layout.arrays["id"].dtype)}
+            ask_for(path, file_size(layout, [n] * frames))
+            with VtkhdfWriter(path, layout, [n] * frames) as writer:
+                for name, array in layout.arrays.items():
+                    if name in fixed:
+                        for _ in range(frames):
+                            writer.append(name, array.pad(fixed[name]))
+                        continue
+                    for block in each.blocks("position" if name == POSITION else name):
+                        writer.append(name, array.pad(block.reshape(len(block) * n, *block.shape[2:])))
+                writer.finish(each.times, each.frames, each.steps, each.ledger(), each.source.header.stored)
             tick()
         whole = all(
             (each.particle_count, each.frame_count) == (each.source.particle_count, each.source.frame_count)
@@ -366,24 +371,6 @@ class Vtkhdf(Format):
         )
         note = "The headers and ledgers stay those of the whole runs: mpmcli check finds frames missing."
         return {}, [] if whole else [note]
-
-
-def _write_vtkhdf(path: Path, trajectory: ThinnedTrajectory) -> None:
-    n, frames, layout = trajectory.particle_count, trajectory.frame_count, trajectory.layout
-    # The same for all frames.
-    fixed = {name: trajectory.label(name) for name in LABELS} | {"id": np.arange(n, dtype=layout.arrays["id"].dtype)}
-    ask_for(path, file_size(layout, [n] * frames))
-    with VtkhdfWriter(path, layout, [n] * frames) as writer:
-        for name, array in layout.arrays.items():
-            if name in fixed:
-                for _ in range(frames):
-                    writer.append(name, array.pad(fixed[name]))
-                continue
-            for block in trajectory.blocks("position" if name == POSITION else name):
-                joined = block.reshape(len(block) * n, *block.shape[2:])
-                writer.append(name, array.pad(joined))
-        header = trajectory.source.header.stored
-        writer.finish(trajectory.times, trajectory.frames, trajectory.steps, trajectory.ledger(), header)
 
 
 def write_npz(path: Path, arrays: Iterable[tuple[str, np.ndarray]]) -> None:

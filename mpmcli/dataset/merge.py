@@ -1,15 +1,12 @@
 """Joins the parts of a dataset that `mpmcli sweep --shard` has computed."""
 
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-from mpmcli.dataset.card import write_card
-from mpmcli.dataset.folder import Manifest, require_empty
-from mpmcli.dataset.report import Status, status_of, verify
+from mpmcli.dataset.folder import Manifest, copy_sources, require_empty
+from mpmcli.dataset.report import Status, status_of, verify, write_card
 from mpmcli.dataset.shard import BASE, QUARANTINE, SHARDS, SWEEP
-from mpmcli.dataset.sources import copy_sources
 from mpmcli.errors import InputError, RunError
 from mpmcli.output.durable import require_free_space, sealed, write_text
 from mpmcli.output.lock import take_lock
@@ -38,27 +35,22 @@ def merge(parts: Sequence[Path], target: Path) -> Status:
     target.mkdir(parents=True, exist_ok=True)
     with take_lock(target):
         require_empty(target, locked=True)
-        _join(parts, target, files, facts[0])
+        size = sum(file.stat().st_size for file in files)
+        require_free_space(target, size, "the merged dataset", "the parts are kept", several=True)
+        # First, so that what a kill leaves lacks what its manifest names.
+        manifest = Manifest(target)
+        manifest.create({**facts[0], "part": [1, 1]})
+        manifest.put(row for part in parts for row in Manifest(part).rows())
+        try:
+            for file in files:
+                copy = target / file.parent.name / file.name
+                copy.parent.mkdir(exist_ok=True)
+                with sealed(copy, file.stat().st_size) as temporary:
+                    shutil.copyfile(file, temporary)
+            for name in (SWEEP, BASE):
+                write_text(target / name, (parts[0] / name).read_text(encoding="utf-8"))
+            copy_sources(facts[0].get("files", ()), parts[0], target)
+        except OSError as error:
+            raise RunError(f"{target} could not be written ({error.strerror}); the parts are kept.") from error
+        write_card(target)
     return status_of(target)
-
-
-def _join(parts: Sequence[Path], target: Path, files: Sequence[Path], facts: Mapping[str, Any]) -> None:
-    """Copy files of the parts, and write what belongs to the whole."""
-    size = sum(file.stat().st_size for file in files)
-    require_free_space(target, size, "the merged dataset", "the parts are kept", several=True)
-    # First, so that what a kill leaves lacks what its manifest names.
-    manifest = Manifest(target)
-    manifest.create({**facts, "part": [1, 1]})
-    manifest.put(row for part in parts for row in Manifest(part).rows())
-    try:
-        for file in files:
-            copy = target / file.parent.name / file.name
-            copy.parent.mkdir(exist_ok=True)
-            with sealed(copy, file.stat().st_size) as temporary:
-                shutil.copyfile(file, temporary)
-        for name in (SWEEP, BASE):
-            write_text(target / name, (parts[0] / name).read_text(encoding="utf-8"))
-        copy_sources(facts.get("files", ()), parts[0], target)
-    except OSError as error:
-        raise RunError(f"{target} could not be written ({error.strerror}); the parts are kept.") from error
-    write_card(target)

@@ -8,7 +8,7 @@ import numpy as np
 
 from mpmcli import __version__
 from mpmcli.dataset.shard import SPLITS
-from mpmcli.dataset.thinned import ThinnedTrajectory
+from mpmcli.dataset.subsample import SubsampledTrajectory
 from mpmcli.errors import InputError
 from mpmcli.output.header import RunHeader
 
@@ -25,7 +25,7 @@ LEAST_FRAMES = 3
 STD_LEAST = 1e-7
 
 
-def common_facts(trajectories: Sequence[ThinnedTrajectory], stride: int) -> dict[str, Any]:
+def common_facts(trajectories: Sequence[SubsampledTrajectory], stride: int) -> dict[str, Any]:
     """Return what every format says, lengths in m and times in s; an InputError says that dimensions differ."""
     headers = [each.source.header for each in trajectories]
     first = headers[0]
@@ -71,7 +71,7 @@ def domain_around(headers: Sequence[RunHeader]) -> tuple[np.ndarray, np.ndarray]
     return np.min([h.origin for h in headers], axis=0), np.max([h.upper for h in headers], axis=0)
 
 
-def outruns_periods(trajectory: ThinnedTrajectory) -> bool:
+def outruns_periods(trajectory: SubsampledTrajectory) -> bool:
     """Return whether a particle goes half of the way of a periodic axis, or more, from one exported frame to the next.
 
     Positions alone do not tell then which way it went. All frames are read: displacements of those left out add up.
@@ -82,7 +82,7 @@ def outruns_periods(trajectory: ThinnedTrajectory) -> bool:
     axes = np.flatnonzero(header.periodic)
     period = (header.upper - header.origin)[axes]
     longest = np.diff(trajectory.source.times).max(initial=0.0)
-    whole = ThinnedTrajectory(trajectory.source)
+    whole = SubsampledTrajectory(trajectory.source)
     number, position, way = 0, None, 0.0
     for block, velocity in zip(whole.blocks("position"), whole.blocks("velocity"), strict=True):
         if (np.abs(velocity[..., axes]) * longest >= period / 2).any():
@@ -98,7 +98,7 @@ def outruns_periods(trajectory: ThinnedTrajectory) -> bool:
     return False
 
 
-def learning_facts(trajectories: Sequence[ThinnedTrajectory]) -> tuple[dict[str, list[float]], list[str]]:
+def learning_facts(trajectories: Sequence[SubsampledTrajectory]) -> tuple[dict[str, list[float]], list[str]]:
     """Return the statistics of motion of the training split, or of all where it is empty, and a note if so."""
     train = [each for each in trajectories if each.source.split == "train"]
     notes = [] if train else ["No trajectory is of the training split: the statistics are those of all trajectories."]
@@ -111,7 +111,7 @@ def learning_facts(trajectories: Sequence[ThinnedTrajectory]) -> tuple[dict[str,
     return {name: vector.tolist() for name, vector in statistics.items()}, notes
 
 
-def require_alike(trajectories: Sequence[ThinnedTrajectory], form: str) -> None:
+def require_alike(trajectories: Sequence[SubsampledTrajectory], form: str) -> None:
     """Refuse with an InputError trajectories that training code cannot, or should not, load as one set."""
     first, remedy = trajectories[0], "--to npz takes trajectories that differ."
     dt = time_between(first)
@@ -141,7 +141,7 @@ def require_alike(trajectories: Sequence[ThinnedTrajectory], form: str) -> None:
             raise InputError(f"trajectory {number} does not say its domain and bodies, which {form} needs; {remedy}")
 
 
-def time_between(trajectory: ThinnedTrajectory) -> float | None:
+def time_between(trajectory: SubsampledTrajectory) -> float | None:
     """Return the mean time between frames, s; None of a single frame."""
     times = trajectory.times
     return float((times[-1] - times[0]) / (len(times) - 1)) if len(times) > 1 else None

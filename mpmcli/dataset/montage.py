@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from mpmcli.dataset.card import MONTAGE, number_text
 from mpmcli.dataset.dataset import Dataset, Trajectory, open_dataset
+from mpmcli.dataset.report import MONTAGE, number_text
 from mpmcli.errors import InputError
-from mpmcli.output.header import BodyHeader, RunHeader
+from mpmcli.output.header import BodyHeader
 from mpmcli.output.layout import POSITION, STANDARD, FrameIndex, FrameLayout
 from mpmcli.output.result import Result
 from mpmcli.render.frame_choice import evenly_spaced
@@ -59,10 +59,13 @@ class TrajectoryCells(Result):
             raise InputError(f"{dataset.path} has trajectories of 2 and 3 dimensions, or without a domain.")
         self._first_bodies = np.cumsum([0, *(len(header.bodies) for header in headers)])
         self.captions = _captions(self._trajectories)
+        layouts = [each.layout() for each in self._trajectories]
+        names = dict.fromkeys((POSITION, *STANDARD, *layouts[0].arrays))
+        common = [name for name in names if all(name in each.arrays for each in layouts)]
         pairs = list(zip(self._trajectories, self._chosen, strict=True))
         times = np.array([each.times[k] for each, k in pairs])
         index = FrameIndex(
-            _common_layout(self._trajectories),
+            FrameLayout(first.dimension, {name: layouts[0].arrays[name] for name in common}),
             first.stored,
             times,
             np.array(numbers),
@@ -75,6 +78,15 @@ class TrajectoryCells(Result):
         self.collider_frames = tuple(each.number for each in self._trajectories for _ in each.colliders)
         title = f"{first.title}, t = {number_text(times[0])} s" if np.ptp(times) == 0 else first.title
         scenes = [header.stored.get("scene", "") for header in headers]
+        alike: dict[str, Any] = {}
+        bodies: list[BodyHeader] = []
+        for header in headers:
+            # The distance of particles is that of the first grid, however fine this one is.
+            finer = (first.spacing / header.spacing) ** header.dimension
+            for body in header.bodies:
+                name = appearance_of(body.material.get("law", "material"), dict(body.material)).name
+                material = alike.setdefault(name, body.material)
+                bodies.append(_Body(body.name, material, body.volume, body.particles_per_cell * finer, body.density))
         self.header = replace(
             first,
             # Pictures are drawn again when this changes.
@@ -82,7 +94,7 @@ class TrajectoryCells(Result):
             title=title,
             origin=np.min([header.origin for header in headers], axis=0),
             upper=np.max([header.upper for header in headers], axis=0),
-            bodies=_all_bodies(headers),
+            bodies=tuple(bodies),
         )
 
     @cached_property
@@ -117,26 +129,6 @@ class _Body(BodyHeader):
         return self.own_density
 
 
-def _all_bodies(headers: Sequence[RunHeader]) -> tuple[BodyHeader, ...]:
-    alike: dict[str, Any] = {}
-    bodies = []
-    for header in headers:
-        # The distance of particles is that of the first grid, however fine this one is.
-        finer = (headers[0].spacing / header.spacing) ** header.dimension
-        for body in header.bodies:
-            name = appearance_of(body.material.get("law", "material"), dict(body.material)).name
-            material = alike.setdefault(name, body.material)
-            bodies.append(_Body(body.name, material, body.volume, body.particles_per_cell * finer, body.density))
-    return tuple(bodies)
-
-
-def _common_layout(trajectories: Sequence[Trajectory]) -> FrameLayout:
-    layouts = [each.layout() for each in trajectories]
-    names = dict.fromkeys((POSITION, *STANDARD, *layouts[0].arrays))
-    common = [name for name in names if all(name in each.arrays for each in layouts)]
-    return FrameLayout(layouts[0].dimension, {name: layouts[0].arrays[name] for name in common})
-
-
 def _position(frame: str | None, trajectory: Trajectory) -> int:
     """Return the position of the frame that a text means in a trajectory."""
     count = trajectory.frame_count
@@ -154,7 +146,10 @@ def _position(frame: str | None, trajectory: Trajectory) -> int:
 
 def _captions(trajectories: Sequence[Trajectory]) -> tuple[str, ...]:
     """Return the number of each trajectory and those drawn values in which the trajectories differ."""
-    draws = [{key: value for key, value in each.draws.items() if _is_short(value)} for each in trajectories]
+    # Placed bodies are lists, and too long.
+    draws = [
+        {key: value for key, value in each.draws.items() if not isinstance(value, list | dict)} for each in trajectories
+    ]
     keys = list(dict.fromkeys(key for values in draws for key in values))
     varying = [key for key in keys if any(values.get(key) != draws[0].get(key) for values in draws)]
     captions = []
@@ -162,11 +157,6 @@ def _captions(trajectories: Sequence[Trajectory]) -> tuple[str, ...]:
         texts = [f"{_name(key)} {_text(values[key])}" for key in varying if key in values]
         captions.append(f"{each.number}: {', '.join(texts)}" if texts else str(each.number))
     return tuple(captions)
-
-
-def _is_short(value: Any) -> bool:
-    """Return whether a drawn value fits a caption; placed bodies are lists."""
-    return not isinstance(value, list | dict)
 
 
 def _name(key: str) -> str:

@@ -27,10 +27,17 @@ from mpmcli.errors import InputError
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output import checksums
 from mpmcli.output.checksums import NAME as CHECKSUMS
-from mpmcli.output.checksums import Checksums, append_checksum, attribute_checksum, store_checksums, table_checksum
+from mpmcli.output.checksums import (
+    Checksums,
+    append_checksum,
+    attribute_checksum,
+    opened,
+    require_format,
+    store_checksums,
+    table_checksum,
+)
 from mpmcli.output.durable import sealed
-from mpmcli.output.ledger_table import ledger_columns, read_ledger
-from mpmcli.output.reading import opened, require_format
+from mpmcli.output.layout import ledger_columns, read_ledger
 
 FORMAT, VERSION = "mpmcli-dataset", 2
 SPLITS = ("train", "valid", "test")
@@ -107,7 +114,8 @@ def write_trajectory(file: h5py.File, data: TrajectoryData, *, compress: bool = 
         options = _storage(array) if compress and moves and array.size else {}
         group.create_dataset(name, data=array, track_times=False, **options)
         known[name] = checksums.kind_checksum(array.dtype, array.shape) if moves else table_checksum(array)
-    store_checksums(group, "", names, _table([arrays[name] for name in names]), known)
+    table = [[checksums.checksum(row) for row in arrays[name]] for name in names]
+    store_checksums(group, "", names, np.array(table, np.uint32).reshape(len(names), len(data.time)).T, known)
 
 
 def join_trajectories(files: Mapping[int, Path], path: Path) -> None:
@@ -118,12 +126,6 @@ def join_trajectories(files: Mapping[int, Path], path: Path) -> None:
             with h5py.File(file, "r") as source:
                 source.copy(group_name(number), joined)
     append_checksum(path)
-
-
-def _table(arrays: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the checksums of arrays of T frames, (T, A) uint32."""
-    columns = [checksums.frame_checksums(array) for array in arrays]
-    return np.array(columns, np.uint32).reshape(len(arrays), len(arrays[0])).T
 
 
 def moving_names(group: h5py.Group) -> list[str]:
@@ -175,12 +177,6 @@ def open_shard(path: Path) -> Iterator[h5py.File]:
             raise InputError(f"{path} is no shard of a dataset of mpmcli: its format is not {FORMAT}.")
         require_format(path, file.attrs["version"], VERSION)
         yield file
-
-
-def shard_splits(path: Path) -> dict[int, str]:
-    """Return the split of each trajectory in a shard, by number; errors are those of `open_shard`."""
-    with open_shard(path) as file:
-        return {int(group.attrs["number"]): str(group.attrs["split"]) for group in file.values()}
 
 
 def _fault(data: TrajectoryData) -> str:
@@ -240,7 +236,9 @@ class StoredGroup:
         """Compare the checksums of all that the group holds."""
         for name in self._checksums.arrays:
             self.frames(name, slice(None))
-        self._checksums.require_items(checksums.item_checksums(self.group, self._checksums.arrays, CHECKSUMS))
+        items = checksums.item_checksums(self.group, self._checksums.arrays, CHECKSUMS)
+        for error in self._checksums.differences(items):
+            raise error
 
     def ledger(self) -> list[LedgerRow]:
         """Read the ledger."""

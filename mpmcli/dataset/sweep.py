@@ -50,21 +50,8 @@ class Distribution:
 
 
 @dataclass(frozen=True)
-class Constant(Distribution):
-    """One value."""
-
-    constant: Any
-
-    def value(self, u: Sequence[float]) -> Any:
-        return self.constant
-
-    def extremes(self) -> list[Any]:
-        return [self.constant]
-
-
-@dataclass(frozen=True)
 class Choice(Distribution):
-    """One of some values, each as likely."""
+    """One of some values, each as likely; of a single one that."""
 
     components = 1
     values: tuple[Any, ...]
@@ -167,7 +154,7 @@ def read_distribution(value: object) -> Distribution:
     with independent components. A flaw is raised for pydantic to report.
     """
     if not isinstance(value, dict):
-        return Constant(value)
+        return Choice((value,))
     kind = _kind(value)
     given = value[kind]
     if kind in ("choice", "grid"):
@@ -451,7 +438,13 @@ class TrajectoryValues:
 
     def __init__(self, sweep: Sweep, number: int, given: Mapping[str, Any]) -> None:
         self.sweep, self.number = sweep, number
-        self.given = {**_grid_values(sweep, number), **given}
+        # Of grids the last one changes from each trajectory to the next.
+        grids, left = {}, number
+        for key, grid in reversed(sweep.distributions.items()):
+            if isinstance(grid, Grid):
+                left, index = divmod(left, len(grid.values))
+                grids[key] = grid.values[index]
+        self.given = {**grids, **given}
         joint = {} if sweep.method == "random" else {k: d for k, d in sweep.vary.items() if d.continuous}
         size = sum(distribution.components for distribution in joint.values())
         numbers = iter(joint_point(sweep.method, sweep.seed, number, size, sweep.count) if size else [])
@@ -468,13 +461,3 @@ class TrajectoryValues:
     def generator(self, stream: str) -> np.random.Generator:
         """Return the random numbers of a stream of this trajectory."""
         return generator(self.sweep.seed, self.number, stream)
-
-
-def _grid_values(sweep: Sweep, number: int) -> dict[str, Any]:
-    """Return the value of every grid; the last one changes from each trajectory to the next."""
-    values = {}
-    for key, grid in reversed(sweep.distributions.items()):
-        if isinstance(grid, Grid):
-            number, index = divmod(number, len(grid.values))
-            values[key] = grid.values[index]
-    return values

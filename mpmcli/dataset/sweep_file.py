@@ -14,10 +14,9 @@ from mpmcli.dataset.draw import PlacementError, draw, template_extent
 from mpmcli.dataset.sweep import ROUND_OFF, Placement, Sweep, SweepTable, is_number
 from mpmcli.errors import InputError
 from mpmcli.scene import parse_scene
-from mpmcli.scene.base import read_scene
-from mpmcli.scene.geometry_file import absence
-from mpmcli.scene.load import report, scene_problems
+from mpmcli.scene.load import read_scene, report, scene_problems
 from mpmcli.scene.material import Laws
+from mpmcli.scene.points import absence
 from mpmcli.scene.problem import Path, Problem, listed, nearest, path_text, problems_of, quoted, written
 from mpmcli.scene.quantity import AXES, NUMBER_WORDS, dimension_of
 from mpmcli.scene.shapes import COMBINED
@@ -126,14 +125,19 @@ def _misshapen(place: Placement, path: Path, shape: dict[str, Any]) -> Iterator[
     if getattr(place, foreign) is not None:
         yield Problem((*path, foreign), f'"{place.template}" is a {form}, which has no {foreign}; give {own}')
     least = 1 if place.list == "bodies" else 0
-    counts = [count for count in place.count.extremes() if not _is_count(count, least)]
+    counts = [
+        count
+        for count in place.count.extremes()
+        if not isinstance(count, int) or isinstance(count, bool) or not least <= count <= MOST_BODIES
+    ]
     if counts:
         right = f"must be whole numbers from {least} to {MOST_BODIES}, such as {{ integers = [1, 3] }}"
         yield Problem((*path, "count"), f"{right}; found {written(counts[0])}")
     room = [high - low for low, high in zip(place.region.min, place.region.max, strict=True)]
     drawn = getattr(place, own)
     for extent in [template_extent(shape)] if drawn is None else drawn.extremes():
-        if form == "box" and not _is_size(extent, len(room)):
+        sized = isinstance(extent, list) and len(extent) == len(room) and all(is_number(x) and x > 0 for x in extent)
+        if form == "box" and not sized:
             right = f"must be {NUMBER_WORDS[len(room)]} numbers greater than 0"
             yield Problem((*path, own), f"{right}; found {written(extent)}")
         elif form == "ball" and not (is_number(extent) and extent > 0):
@@ -143,14 +147,6 @@ def _misshapen(place: Placement, path: Path, shape: dict[str, Any]) -> Iterator[
             if any(x > r * (1 + ROUND_OFF) for x, r in zip(size, room, strict=True)):
                 sides, found = (" x ".join(f"{x:.6g}" for x in lengths) for lengths in (room, size))
                 yield Problem((*path, own), f"must fit into the region, {sides} m; found {found} m")
-
-
-def _is_count(value: object, least: int) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and least <= value <= MOST_BODIES
-
-
-def _is_size(value: object, dimension: int) -> bool:
-    return isinstance(value, list) and len(value) == dimension and all(is_number(x) and x > 0 for x in value)
 
 
 def _owners(sweep: Sweep) -> tuple[dict[Path, Path], list[Problem]]:

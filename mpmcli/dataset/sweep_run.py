@@ -16,15 +16,28 @@ from mpmcli import __version__
 from mpmcli.check.facts import SceneFacts
 from mpmcli.check.forecast import expected_steps, layout_of, seconds_of_one
 from mpmcli.cores import available_cores
-from mpmcli.dataset.card import write_card
 from mpmcli.dataset.compute import Task, Workers, joined_workers, local_workers, scene_fault
 from mpmcli.dataset.draw import draw
-from mpmcli.dataset.folder import MANIFEST, SHARD_BYTES, VERDICTS, Folder, Manifest, Row, require_empty
-from mpmcli.dataset.shard import BASE, LABELS, SWEEP
-from mpmcli.dataset.sources import copy_sources, remove_copies, source_digests, source_files, standing_alone
+from mpmcli.dataset.folder import (
+    MANIFEST,
+    SHARD_BYTES,
+    VERDICTS,
+    Folder,
+    Manifest,
+    Row,
+    copied_files,
+    copy_sources,
+    require_empty,
+    source_digests,
+    source_files,
+    standing_alone,
+)
+from mpmcli.dataset.report import write_card
+from mpmcli.dataset.shard import BASE, LABELS, PENDING, SWEEP, file_name
 from mpmcli.dataset.sweep import Sweep
 from mpmcli.errors import InputError
 from mpmcli.materials.registry import load_plugins
+from mpmcli.output.checksums import path_digest
 from mpmcli.output.durable import SPACE_MARGIN, TEMPORARY_SUFFIX, write_text
 from mpmcli.output.lock import LOCK, refuse_locked, take_lock
 from mpmcli.plain_text import counted, duration_text, size_text, text_table
@@ -151,7 +164,10 @@ def open_folder(
         return Folder(directory, sweep.count, facts["per_shard"], settings.part), manifest
     if (directory / MANIFEST).exists():
         raise InputError(f"{directory} holds a dataset: --resume goes on with it, and -o gives another directory.")
-    if not (settings.resume and _is_beginning(directory)):
+    there = [path.name.removesuffix(TEMPORARY_SUFFIX) for path in directory.iterdir()] if directory.is_dir() else [""]
+    # A sweep may have been killed here before it had a manifest.
+    begun = {name.removesuffix("-journal") for name in there} <= {SWEEP, BASE, MANIFEST, LOCK}
+    if not (settings.resume and begun):
         require_empty(directory)
     size = _bytes_of_trajectories(sweep, settings)
     per_shard = _per_shard(size)
@@ -196,19 +212,17 @@ def discard_beginning(directory: Path, made: Sequence[Path]) -> None:
     if not (directory / MANIFEST).exists() or Manifest(directory).rows():
         return
     with take_lock(directory):
-        Folder(directory, 0, 1, (1, 1)).close()
-        remove_copies(Manifest(directory).facts().get("files", ()), directory)
+        shutil.rmtree(directory / PENDING, ignore_errors=True)
+        for name in copied_files(Manifest(directory).facts().get("files", ())):
+            (directory / name).unlink(missing_ok=True)
+            for parent in list(Path(name).parents)[:-1]:
+                with suppress(OSError):
+                    (directory / parent).rmdir()
         for name in (SWEEP, BASE, MANIFEST):
             (directory / name).unlink(missing_ok=True)
     for path in reversed(made):
         with suppress(OSError):
             path.rmdir()
-
-
-def _is_beginning(directory: Path) -> bool:
-    """Return whether a sweep was killed here before it had a manifest."""
-    names = [path.name.removesuffix(TEMPORARY_SUFFIX) for path in directory.iterdir()] if directory.is_dir() else [""]
-    return {name.removesuffix("-journal") for name in names} <= {SWEEP, BASE, MANIFEST, LOCK}
 
 
 def trajectory_bytes(scene: Scene, particles: int) -> int:
@@ -258,7 +272,7 @@ def run_sweep(
             run.compute_missing(joined, began, on_progress, stop)
             if settings.part == (1, 1):
                 write_card(settings.directory)
-            run.folder.close()
+            shutil.rmtree(settings.directory / PENDING, ignore_errors=True)
             run.state.status = "finished"
         except KeyboardInterrupt:
             run.state.status = "interrupted"
@@ -307,7 +321,9 @@ class _Run:
                 continue
             changed = self.folder.seal(shard, self.rows)
             self._put(changed)
-            self.folder.clear(changed)
+            # The shard holds them now.
+            for row in changed:
+                (self.folder.path / PENDING / file_name(row.number)).unlink(missing_ok=True)
 
     def _put(self, rows: Sequence[Row]) -> None:
         self.manifest.put(rows)
@@ -323,8 +339,7 @@ def _tasks(sweep: Sweep, settings: SweepSettings, numbers: Sequence[int], worker
     plugins = tuple(path.resolve() for path in settings.plugins)
     # A worker may have another working directory, and a namesake there.
     sweep = replace(sweep, base=sweep.base.absolute())
-    digests = source_digests(sweep, plugins)
-    sources = tuple((path, digests[name]) for name, path in source_files(sweep, plugins).items())
+    sources = tuple((path, path_digest(path)) for path in source_files(sweep, plugins).values())
     return [
         Task(directory, sweep, tuple(numbers[i : i + size]), settings.arch, settings.threads, plugins, sources)
         for i in range(0, len(numbers), size)
@@ -399,15 +414,13 @@ class Rehearsal:
         return "\n".join(lines)
 
 
-def rehearse(sweep: Sweep, settings: SweepSettings, stop: Callable[[], bool] = lambda: False) -> Rehearsal:
+def rehearse(sweep: Sweep, settings: SweepSettings) -> Rehearsal:
     """Draw and check the trajectories of a part, and forecast their cost; InputError: none can be drawn."""
     laws = load_plugins(settings.plugins)
     per_shard = _per_shard(_bytes_of_trajectories(sweep, settings))
     folder = Folder(settings.directory, sweep.count, per_shard, settings.part)
     found = []
     for number in folder.all_numbers():
-        if stop():
-            raise KeyboardInterrupt
         values, fault, counts = {}, "", (0, 0, 0, 0.0)
         try:
             drawn = draw(sweep, number)

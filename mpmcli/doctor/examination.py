@@ -1,5 +1,6 @@
 """Tries each component that mpmcli needs, in a process of its own."""
 
+import ctypes
 import importlib.metadata
 import os
 import platform
@@ -16,7 +17,7 @@ from typing import Literal
 
 from mpmcli import __version__
 from mpmcli.plain_text import counted, size_text
-from mpmcli.processes.each import Fault, in_processes
+from mpmcli.processes.pool import Fault, in_processes
 
 # As in pyproject.toml.
 OLDEST, NEWEST = (3, 11), (3, 13)
@@ -30,6 +31,14 @@ PACKAGES = {name: name for name in ("pyvista", "pysplashsurf", "matplotlib", "h5
 }
 # System libraries that packages load, and their Debian packages.
 SYSTEM_PACKAGES = {"libX11": "libx11-6", "libXrender": "libxrender1", "libGL": "libgl1", "libEGL": "libegl1"}
+# The name of a device, and whether it is emulated by the CPU.
+Device = tuple[str, bool]
+NAME_LENGTH = 256
+# VkPhysicalDeviceProperties: offsets of deviceType and deviceName, an upper bound of its size, and the type of a CPU.
+VULKAN_TYPE, VULKAN_NAME, VULKAN_SIZE, VULKAN_CPU = 16, 20, 4096, 4
+# Words of 8 bytes of VkInstanceCreateInfo.
+INSTANCE_INFO_WORDS = 8
+VULKAN_LIBRARIES = {"linux": "libvulkan.so.1", "win32": "vulkan-1.dll", "darwin": "libvulkan.1.dylib"}
 
 
 @dataclass(frozen=True)
@@ -57,7 +66,6 @@ def mpmcli() -> Check:
 
 def taichi(arch: str) -> Check:
     """Examine a backend by starting it. A GPU that is not here is no fault."""
-    from mpmcli.doctor.devices import device_names
     from mpmcli.solver.machine.backend import backend_is_here, try_backend
 
     if arch == "cpu":
@@ -67,10 +75,57 @@ def taichi(arch: str) -> Check:
         return Check("information", "not here")
     try_backend(arch)
     devices = device_names(arch)
-    names = ", ".join(device.name for device in devices) or "device of unknown name"
-    if devices and all(device.is_software for device in devices):
+    names = ", ".join(name for name, _ in devices) or "device of unknown name"
+    if devices and all(is_software for _, is_software in devices):
         return Check("information", f"software only: {names}", "--arch cpu uses the processor directly")
     return Check("ok", names)
+
+
+def device_names(arch: str) -> list[Device]:
+    """Return the devices of a backend by its driver, as Taichi does not name them; empty if that cannot be queried."""
+    from mpmcli.solver.machine.backend import CUDA_LIBRARIES
+
+    asked = {"cuda": (_cuda, CUDA_LIBRARIES), "vulkan": (_vulkan, VULKAN_LIBRARIES)}
+    if arch not in asked:
+        return []
+    ask, libraries = asked[arch]
+    try:
+        return ask(ctypes.CDLL(libraries[sys.platform]))
+    except (OSError, KeyError, AttributeError):
+        return []
+
+
+def _cuda(driver: ctypes.CDLL) -> list[Device]:
+    count, name = ctypes.c_int(), ctypes.create_string_buffer(NAME_LENGTH)
+    if driver.cuInit(0) or driver.cuDeviceGetCount(ctypes.byref(count)):
+        return []
+    devices = []
+    for number in range(count.value):
+        handle = ctypes.c_int()
+        if driver.cuDeviceGet(ctypes.byref(handle), number) or driver.cuDeviceGetName(name, NAME_LENGTH, handle):
+            continue
+        devices.append((name.value.decode(errors="replace"), False))
+    return devices
+
+
+def _vulkan(loader: ctypes.CDLL) -> list[Device]:
+    instance, count = ctypes.c_void_p(), ctypes.c_uint32()
+    # VkInstanceCreateInfo: sType is 1, and all other members may be zero.
+    info = (ctypes.c_uint64 * INSTANCE_INFO_WORDS)(1)
+    if loader.vkCreateInstance(ctypes.byref(info), None, ctypes.byref(instance)):
+        return []
+    loader.vkEnumeratePhysicalDevices(instance, ctypes.byref(count), None)
+    handles = (ctypes.c_void_p * count.value)()
+    loader.vkEnumeratePhysicalDevices(instance, ctypes.byref(count), handles)
+    devices = []
+    for handle in handles[: count.value]:
+        properties = ctypes.create_string_buffer(VULKAN_SIZE)
+        loader.vkGetPhysicalDeviceProperties(ctypes.c_void_p(handle), properties)
+        kind = int.from_bytes(properties[VULKAN_TYPE : VULKAN_TYPE + 4], sys.byteorder)
+        name = properties[VULKAN_NAME : VULKAN_NAME + NAME_LENGTH].split(b"\0")[0].decode(errors="replace")
+        devices.append((name, kind == VULKAN_CPU))
+    loader.vkDestroyInstance(instance, None)
+    return devices
 
 
 def vtk() -> Check:
@@ -114,11 +169,6 @@ def writable(place: Path) -> Check:
     return Check(status, f"{place}, writable, {size_text(free)} free", "" if status == "ok" else "free some space")
 
 
-def kernel_cache() -> Path:
-    """Return the directory of compiled kernels."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "taichi"
-
-
 def memory() -> Check:
     """Examine the memory of this machine."""
     import psutil
@@ -136,7 +186,7 @@ CHECKS: dict[str, Callable[[], Check]] = {
     **{name: partial(package, name, module) for name, module in PACKAGES.items()},
     "ffmpeg": ffmpeg,
     "directory": lambda: writable(Path.cwd()),
-    "kernel cache": lambda: writable(kernel_cache()),
+    "kernel cache": lambda: writable(Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "taichi"),
     "memory": memory,
 }
 OPTIONAL = ("taichi vulkan", "kernel cache")

@@ -54,7 +54,7 @@ class FixedCorotated(Law):
         volumetric = max(parameters.lame_lambda, 0.0) * (d * s ** (2 * d - 2) + volume * s ** (d - 2))
         return [Mode(2 * parameters.shear_modulus + volumetric)]
 
-    def opened(self, J: float) -> float:
+    def rebound_stretch(self, J: float) -> float:
         """Return 2 - J, as the energy of volume is that of J - 1."""
         return 2 - J
 

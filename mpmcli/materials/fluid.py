@@ -237,14 +237,14 @@ class Fluid(Law):
         modes = [Mode(stiffness, volumetric)]
         return modes + [Mode(0.0, 2 * parameters.viscosity)] * (parameters.viscosity > 0)
 
-    def swung(self, bound: StateBound) -> StateBound:
+    def rebound_bound(self, bound: StateBound) -> StateBound:
         """Return the bound with what tension pulls back: J = 1.1 to about 1 / 1.1."""
         if self.cut or not bound.volume_ratio_max > 1:
-            return super().swung(bound)
+            return super().rebound_bound(bound)
         smallest = min(bound.volume_ratio_min, 1 / bound.volume_ratio_max)
-        return super().swung(replace(bound, volume_ratio_min=smallest))
+        return super().rebound_bound(replace(bound, volume_ratio_min=smallest))
 
-    def opened(self, J: float) -> float:
+    def rebound_stretch(self, J: float) -> float:
         """Return a bound on the J > 1 at which x - 1 - ln x is that of J: 1 + W + sqrt(2 W)."""
         W = J - 1 - math.log(J)
         return min(1 / J, 1 + W + math.sqrt(2 * W)) if self.linear else 1 / J

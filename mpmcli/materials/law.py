@@ -23,30 +23,20 @@ SMALLEST = 1e-6
 
 @dataclass(frozen=True)
 class StateBound:
-    """Bounds on the state of all particles of one law.
+    """Bounds on the state of all particles of one law."""
 
-    Attributes:
-        volume_ratio_min, volume_ratio_max: range of J, or of det F, as stored.
-        stretch_squared_max: bound on the largest eigenvalue of b = F F^T (J^2 for a law that keeps J).
-        internal: (smallest, largest) value of each internal variable, by name.
-    """
-
-    volume_ratio_min: float = 1.0
+    volume_ratio_min: float = 1.0  # range of J, or of det F, as stored
     volume_ratio_max: float = 1.0
-    stretch_squared_max: float = 1.0
+    stretch_squared_max: float = 1.0  # of the largest eigenvalue of b = F F^T (J^2 for a law that keeps J)
+    # The smallest and the largest value of each internal variable, by name.
     internal: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
 
 class Mode(NamedTuple):
-    """One eigenmode of the response of an isolated particle to a velocity gradient C (docs/theory.md, 6.1 and 6.2).
+    """One eigenmode of the response of an isolated particle to a velocity gradient C (docs/theory.md, 6.1 and 6.2)."""
 
-    Attributes:
-        stiffness: eigenvalue of d tau / d(C dt), the change of stress per strain increment, Pa.
-        viscosity: eigenvalue of d tau / dC, the change of stress per velocity gradient, Pa s.
-    """
-
-    stiffness: float
-    viscosity: float = 0.0
+    stiffness: float  # eigenvalue of d tau / d(C dt), the change of stress per strain increment, Pa
+    viscosity: float = 0.0  # eigenvalue of d tau / dC, the change of stress per velocity gradient, Pa s
 
 
 def least_stretch(bound: StateBound, dimension: int) -> float:
@@ -165,22 +155,22 @@ class Law(ABC):
         """
         raise NotImplementedError
 
-    def swung(self, bound: StateBound) -> StateBound:
+    def rebound_bound(self, bound: StateBound) -> StateBound:
         """Return the bound that contains what springs back as well.
 
-        A particle alone that is compressed to J and let go opens to `opened` and oscillates between the two for ever:
-        its step must suit both (docs/theory.md, 6.8).
+        A particle alone that is compressed to J and let go opens to `rebound_stretch` and oscillates between the two
+        for ever: its step must suit both (docs/theory.md, 6.8).
         """
         if not 0 < bound.volume_ratio_min < 1:
             return bound
-        opened = self.opened(bound.volume_ratio_min)
+        opened = self.rebound_stretch(bound.volume_ratio_min)
         return replace(
             bound,
             volume_ratio_max=max(bound.volume_ratio_max, opened),
             stretch_squared_max=max(bound.stretch_squared_max, opened ** (2 / self.dimension)),
         )
 
-    def opened(self, J: float) -> float:
+    def rebound_stretch(self, J: float) -> float:
         """Return the J > 1 of about the energy of a volume ratio J, 0 < J < 1: 1 / J where energy is that of ln J."""
         return 1 / J
 
@@ -188,11 +178,8 @@ class Law(ABC):
         """Return a bound on the energy that states hold at the start, (n,), J/m^3 of volume at rest, on the host.
 
         It is S |e|^2 / 2 with the largest stiffness S between rest and the state, and e the logarithms of its
-        stretches. A law whose energy has a short formula overrides this method.
-
-        Args:
-            parameters: of the body.
-            deformation: J, (n,), or F, (n, d, d), finite.
+        stretches; the deformation is J, (n,), or F, (n, d, d), finite. A law whose energy has a short formula overrides
+        this method.
         """
         s = principal(deformation, self.dimension)
         J = s.prod(axis=1)
@@ -212,12 +199,7 @@ class Law(ABC):
         return StateBound(1 / (1 + strain), 1 + strain, (1 + strain) ** 2)
 
     def total_volume_ratio(self, J: np.ndarray, internal: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Return the ratio of volume to volume at rest, (n,).
-
-        Args:
-            J: stored J or det F, (n,).
-            internal: each internal variable by name, (n,).
-        """
+        """Return the ratio of volume to volume at rest, (n,), from the stored J or det F and the internal variables."""
         return J
 
     @ti.func

@@ -30,19 +30,18 @@ def parameter_models() -> tuple[type[MaterialParameters], ...]:
 
 
 def load_plugins(paths: Sequence[Path]) -> tuple[type[MaterialParameters], ...]:
-    """Replace all loaded plugins by these, as `load_plugin` does, and return the parameter models of all laws."""
+    """Replace all loaded plugins by these, and return the parameter models of all laws.
+
+    Each is a Python file that is run and defines `LAW`. InputError: there is no such file, it fails, its LAW is
+    incomplete, or the name of the law is taken.
+    """
     _plugins.clear()
     for path in paths:
-        load_plugin(path)
+        _load_plugin(path)
     return parameter_models()
 
 
-def load_plugin(path: Path) -> type[Law]:
-    """Run a Python file that defines `LAW`, and add that law to the registry.
-
-    Raises:
-        InputError: there is no such file, it fails, its LAW is incomplete, or the name of the law is taken.
-    """
+def _load_plugin(path: Path) -> None:
     module = _run(path)
     law = getattr(module, "LAW", None)
     if law is None:
@@ -56,7 +55,6 @@ def load_plugin(path: Path) -> type[Law]:
             f'{path}: "{law.name}" is the name of the law in {_plugins[law.name][1]}; give LAW another name'
         )
     _plugins[law.name] = (law, path)
-    return law
 
 
 def plugin_file(name: str) -> Path | None:
@@ -89,7 +87,9 @@ def _run(path: Path) -> ModuleType:
     try:
         exec(compile(text, file, "exec"), module.__dict__)
     except (Exception, SystemExit) as error:
-        raise InputError(f"{_place(path, file, error)}: {type(error).__name__}: {_first_line(error)}") from error
+        text = error.msg if isinstance(error, SyntaxError) else str(error)
+        said = next(iter(text.strip().splitlines()), "no more is known")
+        raise InputError(f"{_place(path, file, error)}: {type(error).__name__}: {said}") from error
     return module
 
 
@@ -99,11 +99,6 @@ def _place(path: Path, file: str, error: BaseException) -> str:
     if isinstance(error, SyntaxError) and error.filename == file:
         lines.append(error.lineno)
     return f"{path}:{lines[-1]}" if lines else str(path)
-
-
-def _first_line(error: BaseException) -> str:
-    text = error.msg if isinstance(error, SyntaxError) else str(error)
-    return next(iter(text.strip().splitlines()), "no more is known")
 
 
 def _incomplete(law: object) -> str | None:

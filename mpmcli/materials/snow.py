@@ -118,17 +118,12 @@ class Snow(Law):
         packed, loose = (min(max(J_P, least), most) for J_P in (packed, loose))
         # J_P h is largest at J_P = 1 / hardening.
         worst = min(max(1 / parameters.hardening, packed), loose) if parameters.hardening > 0 else loose
-        packing = d * parameters.hardening * worst * parameters.hardness(worst) * self._largest_stress(parameters)
-        return [Mode(max(parameters.hardness(packed) * elastic, packing))]
-
-    def _largest_stress(self, parameters: SnowParameters) -> float:
-        """Return a bound on |tau_i| / h, Pa."""
-        d = self.dimension
-        low, high = 1 - parameters.critical_compression, 1 + parameters.critical_stretch
-        # (1 - x) x is largest at 1/2.
+        # A bound on |tau_i| / h, Pa; (1 - x) x is largest at 1/2.
         shear = max((1 - max(low, 0.5)) * max(low, 0.5), (high - 1) * high)
         volume = max((1 - max(low**d, 0.5)) * max(low**d, 0.5), (high**d - 1) * high**d)
-        return 2 * parameters.shear_modulus * shear + abs(parameters.lame_lambda) * volume
+        largest_stress = 2 * parameters.shear_modulus * shear + abs(parameters.lame_lambda) * volume
+        packing = d * parameters.hardening * worst * parameters.hardness(worst) * largest_stress
+        return [Mode(max(parameters.hardness(packed) * elastic, packing))]
 
     def stiffest(self, parameters: SnowParameters, bounds: SceneBounds) -> StateBound:
         """Return the state behind a compaction wave, or under the weight of the column.

@@ -117,7 +117,7 @@ class Viscoplastic(Law):
         bulk = max(self.dimension * largest, CARRIED) * parameters.bulk_modulus
         return [Mode(bulk), Mode(2 * parameters.shear_modulus * isochoric)]
 
-    def opened(self, J: float) -> float:
+    def rebound_stretch(self, J: float) -> float:
         """Return a bound on the J > 1 at which x - 1 - ln x is that of J: 1 + W + sqrt(2 W)."""
         W = J - 1 - math.log(J)
         return min(1 / J, 1 + W + math.sqrt(2 * W))

@@ -5,11 +5,4 @@ from mpmcli.output.result import Result, open_result
 from mpmcli.output.run_record import RunRecord, read_record
 from mpmcli.output.store import SegmentStore
 
-__all__ = [
-    "Result",
-    "RunRecord",
-    "SegmentStore",
-    "check_directory",
-    "open_result",
-    "read_record",
-]
+__all__ = ["Result", "RunRecord", "SegmentStore", "check_directory", "open_result", "read_record"]

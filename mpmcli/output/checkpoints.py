@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from mpmcli import __version__
-from mpmcli.output.durable import numbered_files, remove_numbered, require_free_space, sealed, sync_directory
-from mpmcli.output.reading import DAMAGE
+from mpmcli.output.checksums import DAMAGE
+from mpmcli.output.durable import numbered_files, require_free_space, sealed, sync_directory
 
 CHECKPOINTS = "checkpoints"
 CHECKPOINT_NAME = re.compile(r"step_\d{9,}\.npz")
@@ -67,11 +67,6 @@ def read_checkpoints(directory: Path) -> Iterator[Checkpoint]:
     for path in _paths(directory):
         with suppress(*ARCHIVE_DAMAGE):
             yield _read(path)
-
-
-def remove_checkpoints(directory: Path) -> None:
-    """Remove all checkpoints, and their folder unless something else lies in it."""
-    remove_numbered(directory / CHECKPOINTS, CHECKPOINT_NAME)
 
 
 def _add(archive: zipfile.ZipFile, name: str, array: np.ndarray) -> None:

@@ -6,12 +6,15 @@ attribute `list`, JSON, names the A arrays, and gives the CRC-32 of every other 
 CRC-32 of all bytes before them but those of the A arrays, so that large files are read once.
 
 A directory has a file checksums.sha256, as `sha256sum -c` reads it.
+
+What readers raise on a damaged or foreign file of HDF5 becomes one sentence.
 """
 
 import json
 import re
 import zlib
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from hashlib import file_digest
 from pathlib import Path
@@ -19,9 +22,61 @@ from typing import Any, BinaryIO
 
 import h5py
 import numpy as np
+from pydantic import ValidationError
 
-from mpmcli.output.durable import write_text
-from mpmcli.output.reading import DamageError
+from mpmcli.errors import InputError
+
+# Of h5py, numpy, JSON, TOML and pydantic, where content contradicts itself. InputError: a reader said what is wrong.
+DAMAGE = (InputError, OSError, RuntimeError, ValueError, LookupError, TypeError, AttributeError, MemoryError)
+
+
+class DamageError(InputError):
+    """A file that was written by mpmcli, and has changed since."""
+
+
+def first_line(error: Exception) -> str:
+    """Return the first line of what an exception says, without a period at its end, or its type."""
+    if isinstance(error, ValidationError):
+        first = error.errors()[0]
+        return f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+    return (str(error).splitlines() or [type(error).__name__])[0].strip("'\"").rstrip(".")
+
+
+def open_hdf5(path: Path, wanted: str) -> h5py.File:
+    """Open a sealed file for reading, without a lock; InputError: it is no HDF5 file; `wanted` is what to give."""
+    try:
+        try:
+            return h5py.File(path, "r", locking=False)
+        except OSError:
+            # This process has the file open with locking; HDF5 requires one setting for all handles.
+            return h5py.File(path, "r")
+    except OSError as error:
+        reason = "is not an HDF5 file, or a damaged one" if path.exists() else "does not exist"
+        if path.suffix == ".toml" and path.exists():
+            reason = "is a scene, not a result of `mpmcli simulate`"
+        raise InputError(f"{path} {reason}; give {wanted}.") from error
+
+
+@contextmanager
+def opened(path: Path, wanted: str) -> Iterator[h5py.File]:
+    """Open a file as `open_hdf5` does; what reading it raises becomes a DamageError."""
+    with open_hdf5(path, wanted) as file:
+        try:
+            yield file
+        except InputError:
+            raise
+        except DAMAGE as error:
+            what = first_line(error)
+            raise DamageError(f"{path} is damaged: what it should hold cannot be read ({what}).") from error
+
+
+def require_format(path: Path, found: object, ours: int) -> None:
+    """Refuse with an InputError a file of another format than `ours`."""
+    if found != ours:
+        raise InputError(
+            f"{path} has format {found}, and this version of mpmcli reads format {ours}: use the version that wrote it."
+        )
+
 
 NAME = "checksums"
 _LIST, _OWN = "list", "checksum"
@@ -36,11 +91,6 @@ Gap = tuple[int, int]
 def checksum(array: np.ndarray, before: int = 0) -> int:
     """Return the CRC-32 of the bytes of an array, after those whose CRC-32 is `before`."""
     return zlib.crc32(np.ascontiguousarray(array).reshape(-1).view(np.uint8), before)
-
-
-def frame_checksums(array: np.ndarray) -> list[int]:
-    """Return the CRC-32 of each entry of an array along its first axis."""
-    return [checksum(row) for row in array]
 
 
 def kind_checksum(dtype: np.dtype, shape: tuple[int, ...]) -> int:
@@ -123,11 +173,6 @@ class Checksums:
         if self.items.get(key) != found:
             raise damaged(self.file, _item_name(key))
 
-    def require_items(self, found: Mapping[str, int]) -> None:
-        """Compare the checksums of all items (`item_checksums`): none may be missing or unknown."""
-        for error in self.differences(found):
-            raise error
-
     def differences(self, found: Mapping[str, int]) -> list[DamageError]:
         """Return an error for each item (`item_checksums`) that differs, is missing, or is not known."""
         keys = sorted(found.keys() | self.items.keys())
@@ -201,20 +246,13 @@ def checksum_is_right(path: Path, gaps: Sequence[Gap] = ()) -> bool:
 def _file_end(file: BinaryIO, size: int, gaps: Sequence[Gap]) -> bytes:
     """Return what ends a file that has `size` bytes before."""
     total = 0
-    for first, end in _between(gaps, size):
+    starts, ends = [offset for offset, _ in gaps], [offset + length for offset, length in gaps]
+    for first, end in zip([0, *ends], [*(min(start, size) for start in starts), size], strict=True):
         file.seek(first)
         while first < end and (block := file.read(min(_BLOCK, end - first))):
             total = zlib.crc32(block, total)
             first += len(block)
     return _FILE_END.format(total).encode("ascii")
-
-
-def _between(gaps: Sequence[Gap], size: int) -> Iterator[tuple[int, int]]:
-    first = 0
-    for offset, length in gaps:
-        yield first, min(offset, size)
-        first = offset + length
-    yield first, size
 
 
 def path_digest(path: Path) -> str:
@@ -228,34 +266,16 @@ def sums_text(sums: Mapping[str, str]) -> str:
     return "".join(f"{sums[name]}  {name}\n" for name in sorted(sums))
 
 
-def write_sums(directory: Path, sums: Mapping[str, str]) -> None:
-    """Replace checksums.sha256 of a directory in one durable step."""
-    write_text(directory / SUMS, sums_text(sums))
-
-
-def read_sums(directory: Path) -> dict[str, str]:
-    """Read checksums.sha256 of a directory, digests by names of files; DamageError where it is missing or damaged."""
-    path = directory / SUMS
-    try:
-        lines = path.read_bytes().decode("ascii").splitlines(keepends=True)
-    except (OSError, ValueError) as error:
-        raise DamageError(f"{path} is missing or damaged: the files beside it have no checksums.") from error
-    sums: dict[str, str] = {}
-    for line in lines:
-        match = _SUMS_LINE.fullmatch(line)
-        if match is None:
-            raise DamageError(f"{path} is damaged: a line of it is not a checksum and the name of a file.")
-        sums[match[2]] = match[1]
-    return sums
-
-
 def sums_faults(directory: Path) -> tuple[int, list[str]]:
     """Return the number of files that checksums.sha256 lists, and a sentence for each that is missing or changed."""
     try:
-        sums = read_sums(directory)
-    except DamageError as error:
-        return 0, [str(error)]
-    faults = []
+        lines = (directory / SUMS).read_bytes().decode("ascii").splitlines(keepends=True)
+    except (OSError, ValueError):
+        return 0, [f"{directory / SUMS} is missing or damaged: the files beside it have no checksums."]
+    matches = [_SUMS_LINE.fullmatch(line) for line in lines]
+    if None in matches:
+        return 0, [f"{directory / SUMS} is damaged: a line of it is not a checksum and the name of a file."]
+    sums, faults = {match[2]: match[1] for match in matches}, []
     for name, digest in sums.items():
         path = directory / name
         try:

@@ -22,8 +22,8 @@ from mpmcli.output.checksums import append_checksum, load_checksums, store_check
 from mpmcli.output.durable import require_free_space, sealed, write_text
 from mpmcli.output.vtkhdf import FORMAT, LIBVER, open_vtkhdf
 from mpmcli.scene.colliders import Collider
+from mpmcli.scene.mesh import ClosedSurface
 from mpmcli.scene.surface import Surface, collider_surface, form_surface, joined
-from mpmcli.scene.triangles import ClosedSurface
 
 RESTING, MOVING = "colliders.vtkhdf", "colliders_moving.vtkhdf"
 SERIES = "colliders.pvd"
@@ -55,8 +55,9 @@ class ColliderGroup:
     @cached_property
     def meshes(self) -> dict[int, tuple[np.ndarray, np.ndarray]]:
         """Vertices and triangles of those that are read from files, which may be gone later, by number."""
-        pairs = zip(self.numbers, map(_triangles, self.colliders), strict=True)
-        return {number: triangles for number, triangles in pairs if triangles is not None}
+        pairs = zip(self.numbers, self.colliders, strict=True)
+        forms = {number: form_surface(collider.form) for number, collider in pairs if collider.shape.files}
+        return {number: (surface.points, surface.cells) for number, surface in forms.items()}
 
     @property
     def labels(self) -> np.ndarray:
@@ -147,14 +148,6 @@ def read_stored_surfaces(directory: Path) -> dict[int, ClosedSurface]:
                     checksums.require(name, table_checksum(array))
                 found[int(number)] = ClosedSurface(*arrays)
     return found
-
-
-def _triangles(collider: Collider) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return vertices and triangles of a collider whose shape is read from files, None of any other."""
-    if not collider.shape.files:
-        return None
-    surface = form_surface(collider.form)
-    return surface.points, surface.cells
 
 
 def _groups(header: Mapping[str, Any], colliders: Sequence[Collider]) -> Iterator[ColliderGroup]:

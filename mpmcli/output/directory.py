@@ -3,17 +3,17 @@
 import json
 import tempfile
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from mpmcli.errors import InputError
-from mpmcli.output.checkpoints import remove_checkpoints
+from mpmcli.output.checkpoints import CHECKPOINT_NAME, CHECKPOINTS
 from mpmcli.output.collider_files import MOVING, RESTING
-from mpmcli.output.durable import TEMPORARY_SUFFIX, sync_directory, temporary_of, write_text
-from mpmcli.output.lock import LOCK, DirectoryLock, refuse_locked, refused, take_lock, time_now
+from mpmcli.output.durable import TEMPORARY_SUFFIX, remove_numbered, sync_directory, temporary_of, write_text
+from mpmcli.output.layout import DAMAGED, PACKED, remove_segments, sealed_segments
+from mpmcli.output.lock import LOCK, refuse_locked, refused, take_lock, time_now
 from mpmcli.output.run_record import RECORD, read_record
-from mpmcli.output.segments import DAMAGED, PACKED, remove_segments, sealed_segments
 from mpmcli.output.series import is_series_file
 
 SCENE = "scene.toml"
@@ -25,7 +25,7 @@ class TakenDirectory:
     """A directory that this process may write until `release`; of those `made` for it the outermost comes first."""
 
     path: Path
-    lock: DirectoryLock
+    lock: ExitStack
     made: tuple[Path, ...]
 
     def __enter__(self) -> "TakenDirectory":
@@ -38,7 +38,7 @@ class TakenDirectory:
 
     def release(self) -> None:
         """Let others write; a second call does nothing."""
-        self.lock.release()
+        self.lock.close()
 
     def clear(self) -> None:
         """Remove an earlier result; InputError where it cannot be removed."""
@@ -70,7 +70,7 @@ def take_directory(directory: Path, overwrite: bool, *, resume: bool = False) ->
             _remove_result(directory)
     except BaseException:
         if lock is not None:
-            lock.release()
+            lock.close()
         _unmake(made)
         raise
     return TakenDirectory(directory, lock, tuple(made))
@@ -137,7 +137,8 @@ def _refuse_unwritable(directory: Path) -> None:
 
 
 def _remove_result(directory: Path) -> None:
-    ours = [path for path in directory.iterdir() if _is_ours(path.name.removesuffix(TEMPORARY_SUFFIX))]
+    names = {path: path.name.removesuffix(TEMPORARY_SUFFIX) for path in directory.iterdir()}
+    ours = [path for path, name in names.items() if name in NAMES or is_series_file(name)]
     for path in ours:
         if path.is_dir():
             raise InputError(f"{path} is a directory where mpmcli writes a file: give another place with -o.")
@@ -146,16 +147,12 @@ def _remove_result(directory: Path) -> None:
         raise InputError(f"{directory / SCENE} was not written by mpmcli: give another directory with -o.")
     try:
         remove_segments(directory)
-        remove_checkpoints(directory)
+        remove_numbered(directory / CHECKPOINTS, CHECKPOINT_NAME)
         # The record is removed last: while it exists, the remaining files are known to be mpmcli's.
         for path in sorted(ours, key=lambda path: path.name == RECORD):
             path.unlink(missing_ok=True)
     except OSError as error:
         raise InputError(f"The earlier result in {directory} cannot be removed ({error.strerror or error}).") from error
-
-
-def _is_ours(name: str) -> bool:
-    return name in NAMES or is_series_file(name)
 
 
 def has_frames(directory: Path) -> bool:

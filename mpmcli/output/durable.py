@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from mpmcli.errors import NoRoomError
+from mpmcli.errors import DiskFullError
 
 try:
     import resource
@@ -148,7 +148,7 @@ def largest_file() -> int | None:
 def require_free_space(
     directory: Path, size: int, purpose: str, kept: str, *, joined: int = 0, several: bool = False
 ) -> None:
-    """Refuse with NoRoomError to write `size` bytes, to `several` files maybe, that the disk cannot hold.
+    """Refuse with DiskFullError to write `size` bytes, to `several` files maybe, that the disk cannot hold.
 
     `purpose` is the subject of the error's sentence ("frame 7"), `kept` its end ("the 7 frames before it are kept");
     `joined` are bytes of one more file, of this and of what was written before, that is to follow.
@@ -156,7 +156,7 @@ def require_free_space(
     included = "a margin and the packing of all frames up to it" if joined else "a margin"
     free, largest = shutil.disk_usage(directory).free, largest_file()
     if free < size + joined + SPACE_MARGIN:
-        raise NoRoomError(
+        raise DiskFullError(
             f"The disk of {directory} has {free / 1e6:.1f} MB left, but {purpose} needs "
             f"{(size + joined + SPACE_MARGIN) / 1e6:.1f} MB ({included} included): free some space or write to another "
             f"disk with -o; {kept}."
@@ -164,7 +164,7 @@ def require_free_space(
     need = max(0 if several else size, joined)
     if largest is not None and largest < need:
         what = "the packing of all frames up to it needs" if joined > size else "that needs"
-        raise NoRoomError(
+        raise DiskFullError(
             f"{purpose} cannot be written, since {what} a file of {need / 1e6:.3g} MB, and files may have "
             f"{largest / 1e6:.3g} MB here: raise that limit (ulimit -f); {kept}."
         )

@@ -14,12 +14,11 @@ from mpmcli.scene import Scene
 from mpmcli.scene.colliders import Collider, ColliderShape
 from mpmcli.scene.domain import PERIODIC, Walls
 from mpmcli.scene.entry import definitions
-from mpmcli.scene.mesh import Mesh
+from mpmcli.scene.mesh import ClosedSurface, Mesh
 from mpmcli.scene.quantity import AXES
 from mpmcli.scene.schema import SolverSettings, usual_particles_per_cell
 from mpmcli.scene.shapes import BodyShape
-from mpmcli.scene.sheets import emitted_volumes
-from mpmcli.scene.triangles import ClosedSurface
+from mpmcli.scene.sheets import sheets_of
 from mpmcli.stability.transfer_factors import FARTHEST, INTERVAL
 
 _DEFAULTS = {name: field.default for name, field in SolverSettings.model_fields.items()}
@@ -43,12 +42,6 @@ class _Domain(_Facts):
             return ()
         table = self.walls if isinstance(self.walls, dict) else {"default": self.walls}
         return Walls.model_validate(table, context={"dimension": d}).faces(d)
-
-    def is_rough(self, axis: str) -> bool:
-        """Return whether a face normal to an axis has friction."""
-        if not isinstance(self.friction, dict):
-            return self.friction > 0
-        return any(self.friction.get(name, 0) > 0 for name in ("default", f"{axis}_min", f"{axis}_max"))
 
 
 class _Time(_Facts):
@@ -214,6 +207,7 @@ class RunHeader:
         """Return the header of a run that begins; `text` is the complete scene as TOML, laws as in `Frame.material`."""
         # A shape that is read from a file may be gone later.
         from_files = any(body.shape.files for body in scene.bodies)
+        emitted = [sheets_of(emitter, scene) for emitter in scene.emitters]
         return cls.read(
             {
                 "version": __version__,
@@ -231,7 +225,7 @@ class RunHeader:
                 "backend": {name: value for name, value in backend.items() if name != "threads"},
                 "scene": text,
             }
-            | ({"emitter_volumes": emitted_volumes(scene)} if scene.emitters else {})
+            | ({"emitter_volumes": [sheets.particles * sheets.volume for sheets in emitted]} if emitted else {})
             | ({"contacts": [list(pair) for pair in scene.contact_pairs]} if scene.contact_pairs else {})
         )
 
@@ -252,7 +246,9 @@ class RunHeader:
         opens = tuple("open" in pair for pair in faces)
         comes_and_goes = bool(scene.emitters) or any(opens)
         moved = bool(domain.wall_velocity or scene.forces or scene.impulses)
-        sticking = tuple("stick" in pair or domain.is_rough(a) for a, pair in zip(AXES, faces, strict=False))
+        friction = domain.friction if isinstance(domain.friction, dict) else {"default": domain.friction}
+        rough = [any(friction.get(name, 0) > 0 for name in ("default", f"{a}_min", f"{a}_max")) for a in AXES]
+        sticking = tuple("stick" in pair or own for own, pair in zip(rough, faces, strict=False))
         return cls(
             stored=dict(stored),
             title=facts.title,

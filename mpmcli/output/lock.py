@@ -11,7 +11,7 @@ import json
 import os
 import socket
 import time
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from functools import cache
@@ -61,21 +61,19 @@ class Owner:
 
     @classmethod
     def read(cls, facts: Any) -> "Owner | None":
-        """Return the owner that `as_dict` has told, None where these are not such facts."""
+        """Return the owner whose fields were written, None where these are not such facts."""
         try:
             words = {name: str(facts[name]) for name in ("host", "boot")}
             return cls(int(facts["pid"]), float(facts["started"]), space=str(facts.get("space", "")), **words)
         except (TypeError, KeyError, ValueError, AttributeError):
             return None
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return it as JSON can hold it."""
-        return asdict(self)
-
     @property
     def shares_kernel(self) -> bool:
         """Whether it runs or ran under the running kernel, in which locks of files tell of all processes."""
-        return _same_boot(self.boot, _boot())
+        with suppress(ValueError):
+            return abs(float(self.boot) - float(_boot())) < SAME_BOOT
+        return self.boot == _boot()
 
     @property
     def life(self) -> Life:
@@ -130,12 +128,6 @@ def _boot() -> str:
     return f"{psutil.boot_time():.0f}"
 
 
-def _same_boot(one: str, other: str) -> bool:
-    with suppress(ValueError):
-        return abs(float(one) - float(other)) < SAME_BOOT
-    return one == other
-
-
 @cache
 def _space() -> str:
     with suppress(OSError):
@@ -143,33 +135,10 @@ def _space() -> str:
     return ""
 
 
-class DirectoryLock:
-    """A lock that is held; made by `take_lock`."""
-
-    def __init__(self, path: Path, descriptor: int) -> None:
-        self.path = path
-        self._descriptor = descriptor
-
-    def release(self) -> None:
-        """Remove the file and give the lock free; a second call does nothing."""
-        if self._descriptor < 0:
-            return
-        try:
-            with suppress(OSError):
-                self.path.unlink(missing_ok=True)
-        finally:
-            os.close(self._descriptor)
-            self._descriptor = -1
-
-    def __enter__(self) -> "DirectoryLock":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.release()
-
-
-def take_lock(directory: Path) -> DirectoryLock:
+def take_lock(directory: Path) -> ExitStack:
     """Take the lock of a directory, also from a process that has ended; InputError: another has it, or may have it.
+
+    What is returned gives the lock free when it is closed, for the first time. The file is removed then.
 
     Between the look and the taking nothing can come: only the holder of the system's lock reads, writes and removes the
     file. Where a file system has no locks, two processes may take it over at the same moment.
@@ -189,12 +158,18 @@ def take_lock(directory: Path) -> DirectoryLock:
             if got is not False and _is_at(descriptor, path):
                 _refuse_foreign(directory, content, locks_work=got is True)
                 try:
-                    _write(descriptor)
+                    facts = {"machine": socket.gethostname(), "since": time_now(), **asdict(Owner.here())}
+                    os.ftruncate(descriptor, 0)
+                    os.lseek(descriptor, 0, os.SEEK_SET)
+                    os.write(descriptor, (json.dumps(facts) + "\n").encode())
                 except OSError:
                     # The disk is full.
                     path.unlink(missing_ok=True)
                     raise
-                return DirectoryLock(path, descriptor)
+                held = ExitStack()
+                held.callback(os.close, descriptor)
+                held.callback(_remove, path)
+                return held
         except BaseException as error:
             os.close(descriptor)
             if isinstance(error, OSError):
@@ -204,6 +179,11 @@ def take_lock(directory: Path) -> DirectoryLock:
         os.close(descriptor)
         if got is False:
             time.sleep(PAUSE)
+
+
+def _remove(path: Path) -> None:
+    with suppress(OSError):
+        path.unlink(missing_ok=True)
 
 
 def refuse_locked(directory: Path) -> None:
@@ -260,13 +240,6 @@ def _content(path: Path) -> dict[str, Any]:
     return content if isinstance(content, dict) else {}
 
 
-def _write(descriptor: int) -> None:
-    facts = {"machine": socket.gethostname(), "since": time_now(), **Owner.here().as_dict()}
-    os.ftruncate(descriptor, 0)
-    os.lseek(descriptor, 0, os.SEEK_SET)
-    os.write(descriptor, (json.dumps(facts) + "\n").encode())
-
-
 def _refuse_foreign(directory: Path, content: dict[str, Any], *, locks_work: bool) -> None:
     """Refuse a file whose owner may live although the system gives the lock."""
     owner = Owner.read(content)
@@ -299,9 +272,6 @@ def _named(content: dict[str, Any]) -> str:
     owner = Owner.read(content)
     if owner is None:
         return "another process"
-    machine, since = (_printable(content.get(name)) for name in ("machine", "since"))
+    told = (str(content.get(name)) for name in ("machine", "since"))
+    machine, since = ("".join(c if c.isprintable() else "?" for c in text)[:80] for text in told)
     return f"process {owner.pid} on {machine} since {since}"
-
-
-def _printable(value: object) -> str:
-    return "".join(c if c.isprintable() else "?" for c in str(value))[:80]

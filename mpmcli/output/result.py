@@ -1,7 +1,7 @@
 """Reading results: packed file, directory, running or broken directory, all alike."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Literal
@@ -11,14 +11,12 @@ import numpy as np
 from mpmcli.errors import InputError
 from mpmcli.frames.frame import STATUS, Frame
 from mpmcli.frames.ledger import LedgerRow
-from mpmcli.output.checksums import checksum, damaged
+from mpmcli.output.checksums import DamageError, checksum, damaged, first_line
 from mpmcli.output.collider_files import as_they_moved, read_stored_surfaces
 from mpmcli.output.header import RunHeader
-from mpmcli.output.layout import POSITION, STANDARD, FrameIndex
-from mpmcli.output.reading import DamageError, first_line
+from mpmcli.output.layout import PACKED, POSITION, SEGMENTS, STANDARD, FrameIndex, sealed_segments
 from mpmcli.output.run_record import read_record, run_status
-from mpmcli.output.segments import PACKED, SEGMENTS, sealed_segments
-from mpmcli.output.vtkhdf import open_vtkhdf, read_array, read_index_of
+from mpmcli.output.vtkhdf import array_path, open_vtkhdf, read_index_of
 from mpmcli.scene.colliders import Collider
 
 Kind = Literal["packed", "segments"]
@@ -88,7 +86,9 @@ class Result(ABC):
             if name not in self.index.layout.arrays:
                 known = ", ".join(self.field_names) or "none"
                 raise InputError(f'{self.path} holds no field "{name}": its fields are {known}.')
-        return self._frame(k, self._read(k, names))
+        index = self.index
+        stored = self._read(k, names)
+        return index.layout.frame(int(index.frames[k]), float(self.times[k]), int(index.steps[k]), stored)
 
     def present_frame(self, k: int, fields: Sequence[str] | None = None) -> Frame:
         """Read the k-th frame as `frame` does, of the particles that are there alone, where some come or go."""
@@ -104,10 +104,6 @@ class Result(ABC):
         """Read all frames, one at a time."""
         for k in range(self.frame_count):
             yield self.frame(k, fields)
-
-    def _frame(self, k: int, stored: Mapping[str, np.ndarray]) -> Frame:
-        index = self.index
-        return index.layout.frame(int(index.frames[k]), float(self.times[k]), int(index.steps[k]), stored)
 
     @abstractmethod
     def _read(self, k: int, names: Sequence[str]) -> dict[str, np.ndarray]:
@@ -138,7 +134,8 @@ class _StoredResult(Result):
     def _read_arrays(self, path: Path, k: int, names: Sequence[str], offset: int) -> dict[str, np.ndarray]:
         """Read arrays of the k-th frame, which begins at row `offset` of a file, and compare their checksums."""
         with open_vtkhdf(path) as file:
-            stored = {name: read_array(file, name, offset, int(self.particle_counts[k])) for name in names}
+            end = offset + int(self.particle_counts[k])
+            stored = {name: file[f"VTKHDF/{array_path(name)}"][offset:end] for name in names}
         columns = list(self.index.layout.arrays)
         for name, array in stored.items():
             if checksum(array) != self.index.checksums[k, columns.index(name)]:
@@ -166,26 +163,20 @@ def open_result(path: Path) -> Result:
         InputError: there is nothing at `path`, or nothing that mpmcli wrote, or no frame yet.
     """
     path = result_place(path)
-    if path.is_dir():
-        return _open_directory(path)
-    if not path.exists():
-        raise InputError(f"{path} does not exist: give a {PACKED} or its directory.")
-    return _StoredResult(path, "packed", [path])
-
-
-def _open_directory(directory: Path) -> Result:
-    packed = directory / PACKED
-    if not packed.exists() and (segments := sealed_segments(directory)):
+    packed = path / PACKED if path.is_dir() else path
+    if path.is_dir() and not packed.exists() and (segments := sealed_segments(path)):
         try:
-            return _StoredResult(directory, "segments", segments)
+            return _StoredResult(path, "segments", segments)
         except InputError:
             # The run may have ended, and its frames been packed, while they were listed.
             if not packed.exists():
                 raise
     if packed.exists():
         return _StoredResult(packed, "packed", [packed])
-    record = read_record(directory)
+    if not path.is_dir():
+        raise InputError(f"{path} does not exist: give a {PACKED} or its directory.")
+    record = read_record(path)
     if record is None:
-        raise InputError(f"{directory} holds no result of mpmcli: no {PACKED} and no {SEGMENTS}.")
-    status = run_status(directory, record)
-    raise InputError(f'{directory} holds no frame yet: its run is "{status}" and has written none.')
+        raise InputError(f"{path} holds no result of mpmcli: no {PACKED} and no {SEGMENTS}.")
+    status = run_status(path, record)
+    raise InputError(f'{path} holds no frame yet: its run is "{status}" and has written none.')

@@ -1,7 +1,6 @@
 """run.json: what was run, where, how far it came and how it ended."""
 
 import json
-import math
 import os
 import platform
 from collections.abc import Mapping, Sequence
@@ -17,6 +16,7 @@ from mpmcli.errors import RunError
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.durable import write_text
 from mpmcli.output.lock import Owner, lock_is_held, time_now
+from mpmcli.plain_json import finite_json
 
 RECORD = "run.json"
 PROGRAM = "mpmcli"
@@ -100,28 +100,25 @@ class RunRecord:
         facts = asdict(self)
         del facts["directory"]
         facts["command"] = [Path(word).name if i == 0 else word for i, word in enumerate(self.command)]
+        try:
+            taichi = version("taichi")
+        except PackageNotFoundError:
+            taichi = None
+        # What a figure depends on and a name does not; "process" tells machines apart.
+        host = {
+            "python": platform.python_version(),
+            "taichi": taichi,
+            "system": platform.system(),
+            "machine": platform.machine(),
+            "cpu_count": os.cpu_count(),
+        }
         content = {"program": PROGRAM, "version": __version__, **facts}
-        content |= {"process": Owner.here().as_dict(), "host": host_facts()}
-        text = json.dumps(_plain(content), indent=2, ensure_ascii=False)
+        content |= {"process": asdict(Owner.here()), "host": host}
+        text = json.dumps(finite_json(content), indent=2, ensure_ascii=False, default=_plain)
         try:
             write_text(Path(self.directory) / RECORD, text + "\n")
         except OSError as error:
             raise RunError(f"{RECORD} could not be written to {self.directory} ({error.strerror or error}).") from error
-
-
-def host_facts() -> dict[str, Any]:
-    """What a figure depends on and a name does not: versions, system, processors; "process" tells machines apart."""
-    try:
-        taichi = version("taichi")
-    except PackageNotFoundError:
-        taichi = None
-    return {
-        "python": platform.python_version(),
-        "taichi": taichi,
-        "system": platform.system(),
-        "machine": platform.machine(),
-        "cpu_count": os.cpu_count(),
-    }
 
 
 class _StoredRecord(BaseModel):
@@ -154,16 +151,8 @@ def read_record(directory: Path) -> dict[str, Any] | None:
 
 
 def _plain(value: Any) -> Any:
-    """Give numpy values and paths a JSON form; what is not finite becomes null, as JSON has no NaN."""
-    if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if hasattr(value, "tolist"):
-        return _plain(value.tolist())
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return value if value is None or isinstance(value, str | int | bool) else str(value)
+    """Give numpy values and paths a JSON form."""
+    return finite_json(value.tolist()) if hasattr(value, "tolist") else str(value)
 
 
 def run_status(directory: Path, record: dict[str, Any] | None) -> str:

@@ -7,21 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from mpmcli.errors import NoRoomError, RunError
-from mpmcli.output.checksums import SUMS, path_digest, write_sums
-from mpmcli.output.collider_files import (
-    MOVING_FRAME,
-    RESTING_PIECE,
-    as_they_moved,
-    pvd_text,
-    write_collider_series,
-)
+from mpmcli.errors import DiskFullError, RunError
+from mpmcli.output.checksums import SUMS, path_digest, sums_text
+from mpmcli.output.collider_files import MOVING_FRAME, RESTING_PIECE, as_they_moved, pvd_text, write_collider_series
 from mpmcli.output.collider_files import SERIES as COLLIDERS
 from mpmcli.output.durable import is_full, require_free_space, sealed, write_text
-from mpmcli.output.layout import POSITION
-from mpmcli.output.ledger_table import ledger_csv
+from mpmcli.output.layout import PACKED, POSITION, ledger_csv
 from mpmcli.output.result import open_result
-from mpmcli.output.segments import PACKED
 from mpmcli.scene.colliders import Collider
 
 SERIES, SERIES_LEDGER = "particles.pvd", "ledger.csv"
@@ -29,11 +21,6 @@ SERIES_FILES = (SERIES, SERIES_LEDGER, SUMS, COLLIDERS, RESTING_PIECE)
 SERIES_FRAME = re.compile(r"particles_\d{6,}\.vtu")
 # Each particle is a cell of its own: number, offset and type.
 _CELL_BYTES, _FILE_BYTES = 24, 64 * 1024
-
-
-def series_frame_name(index: int) -> str:
-    """File name of the frame with this number."""
-    return f"particles_{index:06d}.vtu"
 
 
 def is_series_file(name: str) -> bool:
@@ -61,7 +48,7 @@ def write_series(
     size = sum(counts) * each + _FILE_BYTES * len(counts)
     try:
         require_free_space(directory, size, "the series of VTK files", kept, several=True)
-        names = [series_frame_name(int(number)) for number in index.frames]
+        names = [f"particles_{number:06d}.vtu" for number in index.frames.tolist()]
         for k, name in enumerate(names):
             if stop():
                 raise KeyboardInterrupt
@@ -74,13 +61,13 @@ def write_series(
         listed = [(time, 0, name) for time, name in zip(times, names, strict=False)]
         write_text(directory / SERIES, pvd_text(listed))
         names += [SERIES, SERIES_LEDGER]
-        write_sums(directory, {name: path_digest(directory / name) for name in names})
+        write_text(directory / SUMS, sums_text({name: path_digest(directory / name) for name in names}))
     except BaseException as error:
         with suppress(OSError):
             remove_series(directory)
         if not isinstance(error, OSError):
             raise
-        fault = NoRoomError if is_full(error) else RunError
+        fault = DiskFullError if is_full(error) else RunError
         raise fault(f"{directory / SERIES} could not be written ({error.strerror or error}); {kept}.") from error
     return directory / SERIES
 

@@ -1,23 +1,37 @@
-"""The store of a run: sealed segments of one or more frames while it goes on, one packed VTKHDF file at the end."""
+"""The store of a run: sealed segments of one or more frames while it goes on, one packed VTKHDF file at the end.
+
+Packing: many sealed files become one file, proved equal before it takes its name.
+"""
 
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from threading import Thread
 from typing import Any
 
-from mpmcli.errors import InputError, NoRoomError, RunError
+import numpy as np
+
+from mpmcli.errors import DiskFullError, InputError, RunError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
+from mpmcli.output.checksums import damaged, open_hdf5
 from mpmcli.output.collider_files import as_they_moved, write_collider_files
-from mpmcli.output.durable import Unsealed, is_full, require_free_space, sync_directory, temporary_of
+from mpmcli.output.durable import Unsealed, is_full, require_free_space, sealed, sync_directory, sync_file, temporary_of
 from mpmcli.output.header import RunHeader
-from mpmcli.output.layout import FrameIndex, FrameLayout
-from mpmcli.output.pack import pack_segments
-from mpmcli.output.segments import PACKED, SEGMENTS, remove_segments, sealed_segments, segment_name
-from mpmcli.output.vtkhdf import VtkhdfWriter, file_size, read_index_of
+from mpmcli.output.layout import (
+    PACKED,
+    SEGMENTS,
+    FrameIndex,
+    FrameLayout,
+    remove_segments,
+    sealed_segments,
+    segment_name,
+)
+from mpmcli.output.verify import verify_file
+from mpmcli.output.vtkhdf import VtkhdfWriter, file_size, read_blocks, read_index_of
 from mpmcli.scene.colliders import Collider
 
 # Bytes of waiting frames above which they are sealed.
@@ -121,7 +135,29 @@ class SegmentStore:
         The segments stay where it cannot be written (RunError), or `stop` ends it with KeyboardInterrupt.
         """
         self.seal()
-        return self._pack(stop)
+        segments = sealed_segments(self._directory)
+        # An interrupt may fall between the seal and the count; a sealed frame is never left behind.
+        if missing := self._sealed - {path.name for path in segments}:
+            raise RunError(
+                f"{self._directory / SEGMENTS} lacks {min(missing)}, one of the {len(self._sealed)} "
+                "files written: it was removed during the run; the others are kept."
+            )
+        if not segments:
+            return None
+        packed = self._directory / PACKED
+        if len(segments) == 1 and not self._compress and not self._kept:
+            os.replace(segments[0], packed)
+            sync_directory(self._directory)
+        else:
+            pack_segments(segments, packed, compress=self._compress, header=self._header, stop=stop)
+        if self._colliders:
+            index = read_index_of(packed)
+            colliders = as_they_moved(self._colliders, index)
+            write_collider_files(self._directory, self._header, index.times.tolist(), colliders)
+        # The result is complete; a segment that somebody holds open may stay beside it.
+        with suppress(OSError):
+            remove_segments(self._directory)
+        return packed
 
     def _start(self) -> None:
         try:
@@ -170,7 +206,7 @@ class SegmentStore:
         if isinstance(error, RunError) or not isinstance(error, OSError | RuntimeError):
             return error
         reason = getattr(error, "strerror", None) or error
-        kind, kept = NoRoomError if is_full(error) else RunError, _frames_kept(self.frames_written)
+        kind, kept = DiskFullError if is_full(error) else RunError, _frames_kept(self.frames_written)
         return kind(f"{purpose} could not be written to {self.place} ({reason}); {kept}.")
 
     def _write(
@@ -194,31 +230,6 @@ class SegmentStore:
             self._counts += counts
 
         return seal
-
-    def _pack(self, stop: Callable[[], bool]) -> Path | None:
-        segments = sealed_segments(self._directory)
-        # An interrupt may fall between the seal and the count; a sealed frame is never left behind.
-        if missing := self._sealed - {path.name for path in segments}:
-            raise RunError(
-                f"{self._directory / SEGMENTS} lacks {min(missing)}, one of the {len(self._sealed)} "
-                "files written: it was removed during the run; the others are kept."
-            )
-        if not segments:
-            return None
-        packed = self._directory / PACKED
-        if len(segments) == 1 and not self._compress and not self._kept:
-            os.replace(segments[0], packed)
-            sync_directory(self._directory)
-        else:
-            pack_segments(segments, packed, compress=self._compress, header=self._header, stop=stop)
-        if self._colliders:
-            index = read_index_of(packed)
-            colliders = as_they_moved(self._colliders, index)
-            write_collider_files(self._directory, self._header, index.times.tolist(), colliders)
-        # The result is complete; a segment that somebody holds open may stay beside it.
-        with suppress(OSError):
-            remove_segments(self._directory)
-        return packed
 
 
 class _Sealing:
@@ -260,3 +271,72 @@ def _frames_kept(count: int) -> str:
     if count == 0:
         return "no frame was written before it"
     return "the frame before it is kept" if count == 1 else f"the {count} frames before it are kept"
+
+
+# Segments with their indices.
+Segments = Sequence[tuple[Path, FrameIndex]]
+
+
+def pack_segments(
+    segments: Sequence[Path],
+    target: Path,
+    *,
+    compress: bool = False,
+    header: Mapping[str, Any],
+    stop: Callable[[], bool] = lambda: False,
+) -> None:
+    """Write all frames of sealed segments of one run into `target`, prove it equal, then give it its name.
+
+    Segments stay as they are; memory is that of a block of one array. "scene" of the header may differ from that of the
+    segments.
+    RunError, and no `target`: the disk is too small, segments are of several runs, or it does not read back.
+    """
+    try:
+        parts = [(segment, read_index_of(segment)) for segment in segments]
+    except InputError as error:
+        raise RunError(f"{error} The frames in {segments[0].parent} were left unpacked.") from error
+    first = parts[0][1]
+    facts = dict(header)
+    for segment, index in parts:
+        if index.layout != first.layout or any(index.header.get(key) != facts[key] for key in facts if key != "scene"):
+            raise RunError(f"{segment} is of another run than {segments[0]}: the frames were left unpacked.")
+    expected = replace(FrameIndex.joined([index for _, index in parts]), header=facts)
+    counts = expected.counts.tolist()
+    kept = f"the {len(counts)} frames written are kept in {segments[0].parent} and stay readable there"
+    purpose = f"packing the frames into {target.name}"
+    size = file_size(first.layout, counts)
+    require_free_space(target.parent, size, purpose, kept)
+    try:
+        with sealed(target, size) as temporary:
+            with VtkhdfWriter(temporary, first.layout, counts, compress=compress) as writer:
+                _copy(parts, writer, stop, by_name=compress)
+                # What was read has the checksums of the segments.
+                k = 0
+                for segment, index in parts:
+                    differing = np.argwhere(writer.checksums[k : k + len(index.counts)] != index.checksums)
+                    for frame, column in differing[:1]:
+                        raise damaged(
+                            str(segment), f"{list(index.layout.arrays)[column]} of frame {index.frames[frame]}"
+                        )
+                    k += len(index.counts)
+                writer.finish(expected.times, expected.frames, expected.steps, expected.ledger, header=expected.header)
+            sync_file(temporary)
+            for fault in verify_file(temporary, stop=stop).faults:
+                raise RunError(f"{target.name} does not read back as it was written ({fault.rstrip('.')}); {kept}.")
+    except (OSError, RuntimeError, InputError) as error:
+        reason = getattr(error, "strerror", None) or error
+        fault = DiskFullError if is_full(error) else RunError
+        raise fault(f"{target} could not be written ({reason}); {kept}.") from error
+
+
+def _copy(segments: Segments, writer: VtkhdfWriter, stop: Callable[[], bool], *, by_name: bool) -> None:
+    """Copy all arrays of all segments, segment by segment, or array by array, which opens each segment more often."""
+    names = list(segments[0][1].layout.arrays)
+    for group in [[name] for name in names] if by_name else [names]:
+        for segment, index in segments:
+            with open_hdf5(segment, "a segment") as source:
+                for name in group:
+                    for block in read_blocks(source, name, int(index.counts.sum())):
+                        if stop():
+                            raise KeyboardInterrupt
+                        writer.append(name, block)

@@ -9,6 +9,7 @@ import numpy as np
 
 from mpmcli.errors import InputError
 from mpmcli.output.checksums import (
+    DAMAGE,
     NAME,
     SUMS,
     FrameChecksums,
@@ -21,11 +22,9 @@ from mpmcli.output.checksums import (
 from mpmcli.output.collider_files import MOVING, RESTING, expected_files
 from mpmcli.output.directory import SCENE
 from mpmcli.output.durable import number_of
-from mpmcli.output.layout import FrameIndex
-from mpmcli.output.reading import DAMAGE
+from mpmcli.output.layout import PACKED, SEGMENTS, FrameIndex, sealed_segments
 from mpmcli.output.result import open_result, result_place
 from mpmcli.output.run_record import read_record
-from mpmcli.output.segments import PACKED, SEGMENTS, sealed_segments
 from mpmcli.output.vtkhdf import open_vtkhdf, read_blocks, read_index
 from mpmcli.plain_text import counted
 
@@ -85,8 +84,18 @@ def verify_result(path: Path) -> Verification:
             files, faults = sums_faults(directory)
             found.files += files
             found.faults += faults
-        if not found.faults:
-            _verify_beside(directory, found)
+    if found.faults or not (path.is_dir() or path.name == PACKED):
+        return found
+    # Compare scene.toml, and which colliders have files, with what the frames say of the scene.
+    header, scene = open_result(directory).header, directory / SCENE
+    text, colliders = header.stored.get("scene"), header.read_colliders({})
+    if scene.exists() and text is not None:
+        found.files += 1
+        if scene.read_bytes() != text.encode("utf-8"):
+            found.faults.append(f"{scene} is not the scene of the frames: it has changed since it was written.")
+    if (directory / PACKED).exists() and colliders and None not in colliders and directory == path:
+        missing = [name for name in expected_files(header.stored, colliders) if not (directory / name).exists()]
+        found.faults += [f"{directory / name} is missing: the scene has colliders." for name in missing]
     return found
 
 
@@ -119,7 +128,7 @@ def _damaged_arrays(file: h5py.File, index: FrameIndex, stop: Callable[[], bool]
     for column, name in enumerate(index.layout.arrays):
         found = FrameChecksums([name], index.counts)
         try:
-            for block in read_blocks(file, name, 0, int(index.counts.sum())):
+            for block in read_blocks(file, name, int(index.counts.sum())):
                 if stop():
                     raise KeyboardInterrupt
                 found.add(name, block)
@@ -147,16 +156,3 @@ def _verify_count(directory: Path, files: Sequence[Path], counts: Sequence[int],
     if isinstance(written, int) and found.frames < written:
         there = counted(found.frames, "frame")
         found.faults.append(f"{directory} holds {there}, but its run has written {written}.")
-
-
-def _verify_beside(directory: Path, found: Verification) -> None:
-    """Compare scene.toml, and which colliders have files, with what the frames say of the scene."""
-    header, path = open_result(directory).header, directory / SCENE
-    text, colliders = header.stored.get("scene"), header.read_colliders({})
-    if path.exists() and text is not None:
-        found.files += 1
-        if path.read_bytes() != text.encode("utf-8"):
-            found.faults.append(f"{path} is not the scene of the frames: it has changed since it was written.")
-    if (directory / PACKED).exists() and colliders and None not in colliders and directory == found.path:
-        missing = [name for name in expected_files(header.stored, colliders) if not (directory / name).exists()]
-        found.faults += [f"{directory / name} is missing: the scene has colliders." for name in missing]

@@ -29,12 +29,12 @@ from mpmcli.output.checksums import (
     gaps_of,
     kind_checksum,
     load_checksums,
+    opened,
+    require_format,
     store_checksums,
     table_checksum,
 )
-from mpmcli.output.layout import POSITION, FrameIndex, FrameLayout
-from mpmcli.output.ledger_table import ledger_columns, read_ledger
-from mpmcli.output.reading import opened, require_format
+from mpmcli.output.layout import POSITION, FrameIndex, FrameLayout, ledger_columns, read_ledger
 
 # A newer upper bound makes files that no VTK can open ("bad version number for layout message").
 LIBVER = ("v110", "v110")
@@ -119,7 +119,15 @@ class VtkhdfWriter:
             self._items[f"VTKHDF/{array_path(name)}"] = kind_checksum(np.dtype(array.dtype), shape)
         for name, table in part_tables(self._counts).items():
             self._put(f"VTKHDF/{name}", table)
-        self._put_connectivity(int(self._counts.max()))
+        # The numbers of the particles, all at once where they are compressed, as chunks may not be divided.
+        n, path = int(self._counts.max()), f"VTKHDF/{CONNECTIVITY}"
+        size = max(1, n if compress else BLOCK_BYTES // 8)
+        data = self._file.create_dataset(path, (n,), np.int64, **self._storage((n,), 8))
+        self._items[path] = kind_checksum(data.dtype, data.shape)
+        for first in range(0, n, size):
+            numbers = np.arange(first, min(first + size, n), dtype=np.int64)
+            data[first : first + size] = numbers
+            self._items[path] = checksum(numbers, self._items[path])
 
     def __enter__(self) -> "VtkhdfWriter":
         return self
@@ -144,17 +152,8 @@ class VtkhdfWriter:
         self._checksums.add(name, rows)
         if data.chunks is None:
             data[first:end] = rows
-        else:
-            self._write_chunks(name, rows, end)
-
-    @property
-    def checksums(self) -> np.ndarray:
-        """Those of the frames written so far, (T, arrays of the layout) uint32."""
-        return self._checksums.table
-
-    def _write_chunks(self, name: str, rows: np.ndarray, end: int) -> None:
-        """Write whole chunks, each at once; those of the last rows of the array whole or not."""
-        data = self._datasets[name]
+            return
+        # Whole chunks, each at once; those of the last rows of the array whole or not.
         if name in self._waiting:
             rows = np.concatenate([self._waiting.pop(name), rows])
         first, size = end - len(rows), data.chunks[0]
@@ -163,6 +162,11 @@ class VtkhdfWriter:
             first, rows = first + len(rows[:size]), rows[size:]
         if len(rows):
             self._waiting[name] = rows
+
+    @property
+    def checksums(self) -> np.ndarray:
+        """Those of the frames written so far, (T, arrays of the layout) uint32."""
+        return self._checksums.table
 
     def finish(
         self,
@@ -196,16 +200,6 @@ class VtkhdfWriter:
     def _put(self, path: str, table: np.ndarray) -> None:
         self._file.create_dataset(path, data=table)
         self._items[path] = table_checksum(table)
-
-    def _put_connectivity(self, n: int) -> None:
-        """Write the numbers of the n particles, all at once where they are compressed, as chunks may not be divided."""
-        path, size = f"VTKHDF/{CONNECTIVITY}", n if self._compress else BLOCK_BYTES // 8
-        data = self._file.create_dataset(path, (n,), np.int64, **self._storage((n,), 8))
-        self._items[path] = kind_checksum(data.dtype, data.shape)
-        for first in range(0, n, max(1, size)):
-            numbers = np.arange(first, min(first + size, n), dtype=np.int64)
-            data[first : first + size] = numbers
-            self._items[path] = checksum(numbers, self._items[path])
 
     def _put_attribute(self, path: str, name: str, value: Any) -> None:
         self._file[path].attrs[name] = value
@@ -273,14 +267,9 @@ def read_index_of(path: Path) -> FrameIndex:
         return read_index(file)
 
 
-def read_array(file: h5py.File, name: str, offset: int, count: int) -> np.ndarray:
-    """Read one array of one frame, in the form of the file; its checksum is not compared."""
-    return file[f"VTKHDF/{array_path(name)}"][offset : offset + count]
-
-
-def read_blocks(file: h5py.File, name: str, offset: int, count: int) -> Iterator[np.ndarray]:
-    """Yield rows of one array as `read_array`, BLOCK_BYTES at a time."""
+def read_blocks(file: h5py.File, name: str, count: int) -> Iterator[np.ndarray]:
+    """Yield the first rows of one array, in the form of the file, BLOCK_BYTES at a time; no checksum is compared."""
     data = file[f"VTKHDF/{array_path(name)}"]
     size = max(1, BLOCK_BYTES * len(data) // max(1, data.nbytes))
-    for first in range(offset, offset + count, size):
-        yield data[first : min(first + size, offset + count)]
+    for first in range(0, count, size):
+        yield data[first : min(first + size, count)]

@@ -2,13 +2,20 @@
 
 import textwrap
 from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from mpmcli.errors import InputError
+from mpmcli.frames.frame import Frame
+from mpmcli.frames.ledger import LedgerRow
+from mpmcli.output.header import RunHeader
+from mpmcli.output.layout import TEXT
+from mpmcli.output.result import Result
 from mpmcli.plain_text import one_line
-from mpmcli.plot.history import History
 from mpmcli.plot.style import THEMES, Theme, ThemeName, drawing, pixels
+from mpmcli.render.frame_choice import evenly_spaced
 from mpmcli.scene.problem import listed
 from mpmcli.stability.limits import COURANT
 
@@ -16,6 +23,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+FRAMES_MAX = 200  # frames whose positions are read; more would not be seen in the figure
+BODIES_MAX = 6  # more bodies than this are shown as one
+NAMED = 5  # frames that a note names
 LABEL_WIDTH = 24  # characters in a line of a label beside the axis of values
 MARKED = 8  # fewer points than this are marked, since a single one makes no line
 FEW_DECADES = 2.5  # fewer decades than this have numbers at 2 and 5 times their powers, too
@@ -25,6 +35,83 @@ COLLIDERS_MAX = 6  # more colliders than this are shown as one, and no more pair
 AXES = "xyz"
 # The order of the colours is that of the legend.
 LIMITS = ("wave", "speed", "force", "viscosity", "deformation", "forced", "maximum")
+
+
+@dataclass(frozen=True)
+class History:
+    """One run over time."""
+
+    title: str  # of the scene
+    header: RunHeader
+    particles: int  # in the last frame
+    status: str  # of the result
+    columns: dict[str, np.ndarray]  # of the ledger, (T,) float64, momenta (T, components); NaN where it is not finite
+    limits: tuple[str, ...]  # T names of the bound on the step, "" at the initial state
+    # How far the particles reach in some of the frames.
+    reach_times: np.ndarray  # (F,) s
+    names: tuple[str, ...]  # of B bodies, or one name for all of them
+    lowest: np.ndarray  # (F, B, d) m, NaN where a body has no particle; `highest` alike
+    highest: np.ndarray
+    notes: tuple[str, ...]  # sentences about what the figure does not show
+
+    @property
+    def times(self) -> np.ndarray:
+        """(T,) s."""
+        return self.columns["time"]
+
+
+def read_history(result: Result) -> History:
+    """Read what a figure of a result shows; InputError where a frame or the ledger is damaged."""
+    rows = result.ledger
+    if len(rows) != result.frame_count:
+        raise InputError(f"{result.path} is damaged: it has {result.frame_count} frames and {len(rows)} ledger rows.")
+    columns, broken = {}, []
+    for name in (entry.name for entry in fields(LedgerRow) if entry.name != TEXT):
+        if rows and getattr(rows[0], name) is None:
+            # Of scenes in which particles come and go.
+            continue
+        values = np.array([getattr(row, name) for row in rows], dtype=np.float64)
+        columns[name] = np.where(np.isfinite(values), values, np.nan)
+        broken.append(~np.isfinite(values).reshape(len(rows), -1).all(1))
+    notes, lost = [], np.flatnonzero(np.any(broken, 0))
+    if len(lost):
+        named = ", ".join(str(result.numbers[k]) for k in lost[:NAMED])
+        named += f" and {len(lost) - NAMED} more" if len(lost) > NAMED else ""
+        frames = "frame" if len(lost) == 1 else "frames"
+        notes.append(f"The ledger holds numbers that are not finite in {frames} {named}; they are gaps in the figure.")
+    chosen = evenly_spaced(range(result.frame_count), FRAMES_MAX)
+    if len(chosen) < result.frame_count:
+        notes.append(f"The reach of the particles is read from {len(chosen)} of {result.frame_count} frames.")
+    bodies = result.header.body_names
+    apart = 1 < len(bodies) <= BODIES_MAX
+    labels = range(len(bodies)) if apart else [None]
+    extents = [[_extent(frame, label) for label in labels] for frame in (result.present_frame(k, ()) for k in chosen)]
+    both = np.array(extents).reshape(len(chosen), len(labels), 2, result.dimension)
+    names = bodies if apart else (bodies[0] if len(bodies) == 1 else "all bodies",)
+    return History(
+        title=one_line(result.header.title) or result.path.stem,
+        header=result.header,
+        particles=int(result.particle_counts[-1]),
+        status="" if result.record is None else result.status,
+        columns=columns,
+        limits=tuple(row.limit for row in rows),
+        reach_times=result.times[chosen],
+        names=tuple(one_line(name) for name in names),
+        lowest=both[:, :, 0],
+        highest=both[:, :, 1],
+        notes=tuple(notes),
+    )
+
+
+def _extent(frame: Frame, label: int | None) -> np.ndarray:
+    """Return the lowest and the highest coordinates of a body, or of all, that are finite: (2, d)."""
+    position = frame.position.astype(np.float64)
+    kept = np.isfinite(position).all(1)
+    if label is not None:
+        kept &= frame.body == label
+    if not kept.any():
+        return np.full((2, position.shape[1]), np.nan)
+    return np.array([position[kept].min(0), position[kept].max(0)])
 
 
 def ledger_picture(history: History, size: tuple[int, int], theme: ThemeName) -> tuple[np.ndarray, list[str]]:
@@ -242,10 +329,10 @@ def _extremes(volume: Panel, speed: Panel, history: History) -> None:
 
 
 def _reach(panel: Panel, history: History, axis: int) -> None:
-    header, reach = history.header, history.reach
+    header = history.header
     panel.title(f"Reach along {AXES[axis]}", "lowest to highest particle, m")
-    for k, name in enumerate(reach.names):
-        panel.band(reach.lowest[:, k, axis], reach.highest[:, k, axis], name, k, times=reach.times)
+    for k, name in enumerate(history.names):
+        panel.band(history.lowest[:, k, axis], history.highest[:, k, axis], name, k, times=history.reach_times)
     if header.origin is not None and header.upper is not None:
         panel.level(float(header.origin[axis]), "walls")
         panel.level(float(header.upper[axis]))

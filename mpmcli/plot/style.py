@@ -68,7 +68,14 @@ def drawing(size: tuple[int, int], theme: Theme) -> "AbstractContextManager[Figu
     dpi = DPI * (size[0] * size[1] / AREA) ** 0.5
     # A hundredth of a pixel more, since the canvas rounds down.
     inches = (size[0] + 0.01) / dpi, (size[1] + 0.01) / dpi
-    return empty_figure(inches, LEDGER, _settings(theme), (0.09, 0.07), dpi)
+    settings = {
+        **dict.fromkeys(("axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color"), theme.faint),
+        **dict.fromkeys(("axes.titlecolor", "text.color"), theme.ink),
+        "axes.facecolor": theme.panel,
+        "grid.color": theme.grid,
+        "figure.facecolor": theme.ground,
+    }
+    return empty_figure(inches, LEDGER, settings, (0.09, 0.07), dpi)
 
 
 def pixels(figure: "Figure") -> np.ndarray:
@@ -78,13 +85,3 @@ def pixels(figure: "Figure") -> np.ndarray:
         warnings.filterwarnings("ignore", "Glyph", UserWarning)
         figure.canvas.draw()
     return np.asarray(figure.canvas.buffer_rgba())[:, :, :3].copy()  # type: ignore[attr-defined]
-
-
-def _settings(theme: Theme) -> dict[str, Any]:
-    return {
-        **dict.fromkeys(("axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color"), theme.faint),
-        **dict.fromkeys(("axes.titlecolor", "text.color"), theme.ink),
-        "axes.facecolor": theme.panel,
-        "grid.color": theme.grid,
-        "figure.facecolor": theme.ground,
-    }

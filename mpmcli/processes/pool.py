@@ -1,19 +1,122 @@
-"""Carries out many tasks of one job, such as the frames of a film, in several processes at once."""
+"""Tasks in other processes: each in one of its own, or many of one job, such as the frames of a film, in a few.
+
+In a process of its own the crash of one task, or its being late, is that of no other.
+"""
 
 import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import connection
-from typing import Any, Protocol
+from contextlib import contextmanager
+from dataclasses import dataclass
+from multiprocessing import connection, get_context, resource_tracker
+from typing import Any, Protocol, TypeVar
 
 from mpmcli.cores import available_cores
 from mpmcli.errors import RunError
-from mpmcli.processes.each import SPAWN
-from mpmcli.processes.interrupts import interrupts_blocked
+
+T = TypeVar("T")
+# Taichi starts once in a process, in one precision, and must not be forked.
+SPAWN = get_context("spawn")
+# Between two looks at which tasks have ended, s.
+LOOK = 0.1
+
+
+@contextmanager
+def interrupts_blocked() -> Iterator[None]:
+    """Block SIGINT for all that is started here: Ctrl-C reaches all processes, and this one ends the others."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    # The first process starts this, which unblocks the signal.
+    resource_tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Why there is no answer, such as "its process ended with exit code 3"."""
+
+    words: str
+
+
+def in_processes(
+    tasks: Sequence[T],
+    workers: int,
+    work: Callable[[T], Any],
+    timeout: float,
+    stop: Callable[[], object] = lambda: False,
+) -> Iterator[tuple[T, Any]]:
+    """Yield (task, work(task) or a Fault) as processes end, `workers` at a time. None is left when this ends.
+
+    Args:
+        work: what a process does, a function of a module; what libraries print there appears nowhere.
+        timeout: of a task, s.
+        stop: polled; where it returns True, KeyboardInterrupt is raised.
+    """
+    waiting, going = list(reversed(tasks)), {}
+    try:
+        while waiting or going:
+            while waiting and len(going) < workers:
+                task = waiting.pop()
+                answers, process = _started(work, task)
+                going[answers] = task, process, time.monotonic() + timeout
+            ready = connection.wait(going, LOOK)
+            if stop():
+                raise KeyboardInterrupt
+            now = time.monotonic()
+            for answers in [answers for answers, (*_, end) in going.items() if answers in ready or now > end]:
+                task, process, _ = going.pop(answers)
+                try:
+                    answer = answers.recv() if answers in ready else Fault(f"it took longer than {timeout:g} s")
+                except EOFError:
+                    process.join()
+                    answer = Fault(f"its process ended with exit code {process.exitcode}")
+                _end_one(answers, process)
+                yield task, answer
+    finally:
+        for answers, (_, process, _) in going.items():
+            _end_one(answers, process)
+
+
+def _started(work: Callable[[T], Any], task: T) -> tuple[connection.Connection, SPAWN.Process]:
+    answers, theirs = SPAWN.Pipe(duplex=False)
+    process = SPAWN.Process(target=_answer, args=(work, task, theirs), daemon=True)
+    with interrupts_blocked():
+        process.start()
+    theirs.close()
+    return answers, process
+
+
+def _end_one(answers: connection.Connection, process: SPAWN.Process) -> None:
+    process.kill()
+    process.join()
+    answers.close()
+
+
+def silence() -> None:
+    """Let nothing of what libraries print in this process appear."""
+    silent = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(silent, 1)
+    os.dup2(silent, 2)
+
+
+def _answer(work: Callable[[T], Any], task: T, answers: connection.Connection) -> None:
+    silence()
+    try:
+        answer = work(task)
+    except Exception as error:
+        answer = Fault(f"{type(error).__name__}: {error}")
+    answers.send(answer)
+
 
 # Seconds between two looks at whether to stop.
 PAUSE = 0.05
@@ -129,10 +232,9 @@ def _begin(job: Job) -> None:
     global _job
     _job = job
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, _leave)
-    silent = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(silent, 1)
-    os.dup2(silent, 2)
+    # KeyboardInterrupt, as no handler of errors must stop it.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    silence()
     threading.Thread(target=_follow, daemon=True).start()
 
 
@@ -140,11 +242,6 @@ def _follow() -> None:
     """End with the process that started this one: it may be killed."""
     connection.wait([multiprocessing.parent_process().sentinel])
     os._exit(1)
-
-
-def _leave(*_: object) -> None:
-    # The base class, as no handler of errors must stop it.
-    raise KeyboardInterrupt
 
 
 def _render(k: int) -> Any:

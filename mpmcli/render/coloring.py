@@ -125,14 +125,13 @@ def _value(name: str, result: Result, scene: RenderScene) -> Coloring:
     stored = result.field_names
     densities = np.array(scene.densities)
     if name == "speed":
-        return Coloring("speed", "m/s", (), lambda frame: _length(frame.velocity), floor=0.0)
+        return Coloring("speed", "m/s", (), lambda f: np.linalg.norm(f.velocity.astype(np.float64), axis=1), floor=0.0)
     if name == "id":
         return Coloring("particle", "", (), lambda frame: np.arange(len(frame.position), dtype=np.float64))
-    if name == "density":
-        if "density" not in stored and "volume_ratio" in stored:
-            fields = ("volume_ratio",)
-            return Coloring("density", "kg/m³", fields, lambda f: densities[f.body] / _scalar(f, "volume_ratio"))
-    elif name == "J":
+    if name == "density" and "density" not in stored and "volume_ratio" in stored:
+        fields = ("volume_ratio",)
+        return Coloring("density", "kg/m³", fields, lambda f: densities[f.body] / _scalar(f, "volume_ratio"))
+    if name == "J":
         if "volume_ratio" in stored:
             return Coloring("J", "", ("volume_ratio",), lambda frame: _scalar(frame, "volume_ratio"), middle=1.0)
         if "density" in stored:
@@ -159,7 +158,7 @@ def _field(name: str, result: Result) -> Coloring:
     if not component:
         if width == 1:
             return Coloring(plain, unit, fields, lambda frame: array(frame)[:, 0])
-        return Coloring(f"|{plain}|", unit, fields, lambda frame: _length(array(frame)), floor=0.0)
+        return Coloring(f"|{plain}|", unit, fields, lambda frame: np.linalg.norm(array(frame), axis=1), floor=0.0)
     # In 2D the stress has all three axes, and so may other fields.
     known = next((list(AXES[:n]) for n in (2, 3) if width == n), [])
     known = next(([a + b for a in AXES[:n] for b in AXES[:n]] for n in (2, 3) if width == n * n), known)
@@ -219,10 +218,6 @@ def color_map(name: str | None, usual: str = SEQUENTIAL) -> str:
 
 def _scalar(frame: Frame, field: str) -> np.ndarray:
     return np.asarray(frame.fields[field], dtype=np.float64)
-
-
-def _length(vectors: np.ndarray) -> np.ndarray:
-    return np.sqrt(np.square(np.asarray(vectors, dtype=np.float64)).sum(axis=1))
 
 
 def _von_mises(stress: np.ndarray) -> np.ndarray:

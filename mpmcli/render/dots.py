@@ -47,7 +47,7 @@ class DotsPainter:
         self._ground = FlatColliders(scene, view, theme, Slice((0, 1))) if self._flat and scene.colliders else None
         if not self._flat:
             self._offscreen.add_light()
-            self._offscreen.add_box(scene.lower, scene.upper, theme.wall)
+            self._offscreen.add_box(scene)
             self._colliders = ColliderActors(scene, theme, self._offscreen)
 
     def draw(self, frame: Frame) -> np.ndarray:
@@ -75,18 +75,17 @@ class DotsPainter:
         self._offscreen.render()
         picture = self._offscreen.picture()
         if self._flat:
-            return picture if self._ground is None else self._above_colliders(picture, frame)
+            if self._ground is None:
+                return picture
+            # Colliders are between the dots: what lies in a collider is not hidden by it.
+            free = _blocks(~np.isfinite(self._offscreen.depth()), self._offscreen.samples)
+            image = picture / np.float32(255)
+            self._ground.draw(image, frame, free.mean(axis=(1, 3), dtype=np.float32))
+            return (255.0 * image + 0.5).astype(np.uint8)
         depth, others = self._offscreen.depth(), None
         if self._colliders.meshes:
             others = self._colliders.depth_without(self._offscreen)
         return depth_shaded(picture, depth, float(self._diameters.max()), self._view, self._offscreen.samples, others)
-
-    def _above_colliders(self, picture: np.ndarray, frame: Frame) -> np.ndarray:
-        """Draw colliders between the dots: what lies in a collider is not hidden by it."""
-        free = _blocks(~np.isfinite(self._offscreen.depth()), self._offscreen.samples)
-        image = picture / np.float32(255)
-        self._ground.draw(image, frame, free.mean(axis=(1, 3), dtype=np.float32))
-        return (255.0 * image + 0.5).astype(np.uint8)
 
     def _hidden(self, points: np.ndarray, sizes: np.ndarray) -> np.ndarray:
         """Return which dots are wholly covered by others, (n,) bool: leaving them out changes no pixel."""

@@ -48,13 +48,17 @@ class FluidPainter:
         # Absorption scales with the size of the scene: a beaker and a reservoir look alike.
         self._length = float(np.cbrt(np.prod(np.maximum(extent, 1e-3 * extent.max()))))
         self._lamp = lights_of(scene, view, theme)["lampTo"]
-        self._lights = fluid_lights(theme, view.axes @ self._lamp, view.axes @ np.array(scene.up))
+        floor, directions = linear(theme.floor), (view.axes @ self._lamp, view.axes @ np.array(scene.up))
+        around, strengths = ([0.25, 0.47, 0.85], [0.93, 0.96, 1.0], 0.8 * floor), (0.75, 0.45)
+        if theme.name == "dark":
+            around, strengths = ([0.10, 0.15, 0.24], [0.30, 0.36, 0.46], 0.6 * floor), (0.95, 0.36)
+        self._lights = FluidLights(*(np.asarray(vector, np.float32) for vector in (*directions, *around)), *strengths)
         self._background = Background(scene, view, theme)
         # The background without shadows (h, w, 3), in amounts of light.
         self._bare = LINEAR[self._background.image(None)]
         # One window for lines, colliders and dots.
         self._offscreen = OffscreenRenderer(replace(view, size=(view.size[0] * SAMPLES, view.size[1] * SAMPLES)), theme)
-        self._offscreen.add_box(scene.lower, scene.upper, theme.wall, width=1.6 * SAMPLES)
+        self._offscreen.add_box(scene, width=1.6 * SAMPLES)
         self._colliders = ColliderActors(scene, theme, self._offscreen)
         self._offscreen.add_light()
         self._actors: dict[tuple[int, int], pv.Actor] = {}
@@ -231,16 +235,6 @@ class FluidLights:
         sky = self.horizon + (self.zenith - self.horizon) * high
         box = _step((direction @ self.lamp)[..., None], 0.72, 0.97)
         return self.floor + (sky - self.floor) * low + np.float32(0.9 * self.strength) * box
-
-
-def fluid_lights(theme: Theme, lamp: np.ndarray, up: np.ndarray) -> FluidLights:
-    """Return the lights of a theme, for a lamp in a direction."""
-    floor = linear(theme.floor)
-    if theme.name == "dark":
-        around, strengths = ([0.10, 0.15, 0.24], [0.30, 0.36, 0.46], 0.6 * floor), (0.95, 0.36)
-    else:
-        around, strengths = ([0.25, 0.47, 0.85], [0.93, 0.96, 1.0], 0.8 * floor), (0.75, 0.45)
-    return FluidLights(*(np.asarray(vector, np.float32) for vector in (lamp, up, *around)), *strengths)
 
 
 def transmitted(appearance: Appearance, thickness: np.ndarray, length: float) -> np.ndarray:

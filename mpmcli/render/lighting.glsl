@@ -39,7 +39,7 @@ vec3 over = max(color - 0.7, vec3(0.0));
 color = min(color, vec3(0.7)) + 0.3 * over / (over + 0.3);
 fragOutput0 = vec4(pow(max(color, vec3(0.0)), vec3(1.0 / 2.2)), 1.0);
 //// behind
-vec2 bend = -vec2(dot(n, cameraRight), dot(n, cameraUp)) * min(carriedLight.z, thickUnit) * BENT * pixelsToMetre;
+vec2 bend = -vec2(dot(n, cameraRight), dot(n, cameraUp)) * min(carriedLight.z, thickUnit) * 0.08 * pixelsToMetre;
 if (atWall) { bend = vec2(0.0); }
 vec2 place = clamp(here + bend / pictureSize, vec2(0.002), vec2(0.998));
 vec4 seenBehind = texture(behindTexture, place);

@@ -23,8 +23,6 @@ CARRIED = (LIGHT, TINT, ROUGH, OUTWARDS)
 # Handed from vertices to fragments, sampled at the centroid of the covered part of the pixel.
 VARYINGS = "centroid {0} vec4 carriedLight;\ncentroid {0} vec3 carriedTint, carriedRough, worldPoint, worldNormal;\n"
 BEHIND = "behindTexture"  # name of the picture behind clear things, and its depth from 0, near, to 1, far, as alpha
-# How far what lies behind a clear finish is shifted, as a share of its thickness.
-BENT = {"translucent": "0.08", "water": "0.08", "syrup": "0.08"}
 
 
 def lights_of(scene: RenderScene, view: View, theme: Theme) -> dict[str, np.ndarray]:
@@ -85,7 +83,7 @@ def fragment_code(
         kind = "lava"
     towards = "toCamera" if view.parallel else "normalize(cameraAt - worldPoint)"
     common = parts["common"].replace("TOWARDS", towards).replace("WALLED", str(walled).lower())
-    behind = parts["behind"].replace("BENT", BENT[kind]) if kind in BENT else ""
+    behind = parts["behind"] if kind in CLEAR else ""
     return declared, common + behind + parts.get(kind, parts["matte"]) + parts["tone"]
 
 

@@ -146,7 +146,10 @@ def surface_of(liquids: Sequence[Liquid], window: Window, view: View, scene: Ren
     normal = normals(points, free)
     if at_wall.any():
         normal[at_wall] = facing[at_wall]
-    normal = _softened(normal, known, max(SOFTNESS * size, 0.5))
+    # Averaged over their surroundings, and continued a little over the edges.
+    mean = np.stack([blurred(normal[..., k] * known, max(SOFTNESS * size, 0.5)) for k in range(3)], axis=-1)
+    length = np.sqrt(np.einsum("ijk,ijk->ij", mean, mean))[..., None]
+    normal = np.where(length > 1e-6, mean / np.maximum(length, 1e-6), normal)
     return Surface(window, alpha, depth, owner, normal, _hollow(normal, alpha > 0, size))
 
 
@@ -218,13 +221,6 @@ def _passage(window: Window, view: View, scene: RenderScene) -> tuple[np.ndarray
     entered = ends.min(axis=0).argmax(axis=-1)
     outwards = -np.sign(np.take_along_axis(direction, entered[..., None], -1)) * view.axes.T[entered]
     return *(np.where(hit, distance, NOTHING).astype(np.float32) for distance in (first, last)), outwards
-
-
-def _softened(normal: np.ndarray, known: np.ndarray, deviation: float) -> np.ndarray:
-    """Return normals averaged over their surroundings, and continued a little over the edges."""
-    mean = np.stack([blurred(normal[..., k] * known, deviation) for k in range(3)], axis=-1)
-    length = np.sqrt(np.einsum("ijk,ijk->ij", mean, mean))[..., None]
-    return np.where(length > 1e-6, mean / np.maximum(length, 1e-6), normal)
 
 
 def _hollow(normal: np.ndarray, covered: np.ndarray, size: float) -> np.ndarray:
@@ -375,11 +371,8 @@ def normals(points: np.ndarray, covered: np.ndarray) -> np.ndarray:
     (h, w, 3) are in camera axes: to the right, up and towards the viewer, m; there is a surface where it is `covered`.
     """
     across, down = (_smaller_step(points, covered, axis) for axis in (1, 0))
-    normal = np.empty_like(points)
-    # up x right turned round: rows run downwards.
-    for k in range(3):
-        i, j = (k + 1) % 3, (k + 2) % 3
-        normal[..., k] = down[..., i] * across[..., j] - down[..., j] * across[..., i]
+    # Rows run downwards.
+    normal = np.cross(down, across)
     length = np.sqrt(np.einsum("ijk,ijk->ij", normal, normal))
     flat = ~(length > 0)
     normal /= np.where(flat, 1, length)[..., None]

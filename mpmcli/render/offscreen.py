@@ -7,8 +7,9 @@ from PIL import Image
 from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkCommonCore import vtkDataArray, vtkFloatArray, vtkUnsignedCharArray
 
+from mpmcli.render.render_scene import RenderScene
 from mpmcli.render.settings import Theme
-from mpmcli.render.view import View
+from mpmcli.render.view import View, corners_of
 
 if TYPE_CHECKING:
     import pyvista as pv
@@ -20,7 +21,7 @@ class OffscreenRenderer:
     def __init__(self, view: View, theme: Theme, *, samples: int = 1) -> None:
         import pyvista as pv
 
-        self.view, self.samples = view, samples
+        self.view, self.samples, self._theme = view, samples, theme
         width, height = view.size
         self.plotter = pv.Plotter(off_screen=True, window_size=(width * samples, height * samples), lighting="none")
         self.plotter.render_window.SetMultiSamples(0)
@@ -29,12 +30,11 @@ class OffscreenRenderer:
         self.plotter.disable_anti_aliasing()
         view.place(self.plotter)
 
-    def add_box(self, lower: tuple[float, ...], upper: tuple[float, ...], color: str, width: float = 1.5) -> None:
+    def add_box(self, scene: RenderScene, width: float = 1.5) -> None:
         """Draw the edges of the domain, but for the three in front, which would cross all that is inside."""
         import pyvista as pv
 
-        picks = np.array([[i >> axis & 1 for axis in range(3)] for i in range(8)])
-        corners = np.where(picks == 1, np.array(upper), np.array(lower))
+        corners, color = corners_of(scene), self._theme.wall
         front = int((corners @ self.view.axes[2]).argmax())
         edges = [(i, i | 1 << axis) for i in range(8) for axis in range(3) if not i >> axis & 1]
         lines = [[2, *edge] for edge in edges if front not in edge]

@@ -83,7 +83,12 @@ class PictureLayout:
             x, y = self._place(k)
             whole.paste(Image.fromarray(picture), (x, y))
             if self._label:
-                self._caption(draw, captions[k] if captions else time, x, y - self._label // 2)
+                # What fits of a caption, or a time if all of it fits.
+                room = self.viewport_size[0]
+                text = self._cut(captions[k], room) if captions else time_text(time, self.times)
+                free = room - self._small.getlength(text)
+                if free >= 0:
+                    self._write(draw, x + min(self._px(PAD), free), y - self._label // 2, text)
             if self.walls:
                 self._walls(draw, view, (x, y))
             if self.arrows:
@@ -166,14 +171,6 @@ class PictureLayout:
             room -= pad + max(plain.getlength(time_text(t, self.times)) for t in (*self.times[-1:], time))
         title = cut(self.scene.title, lambda text: bold.getlength(text) <= room)
         draw.text((pad, middle), title, self.theme.text, bold, anchor="lm")
-
-    def _caption(self, draw: "ImageDraw", caption: str | float, x: int, y: int) -> None:
-        """Draw what fits of a text above a picture of a montage, or a time if all of it fits."""
-        room = self.viewport_size[0]
-        text = self._cut(caption, room) if isinstance(caption, str) else time_text(caption, self.times)
-        free = room - self._small.getlength(text)
-        if free >= 0:
-            self._write(draw, x + min(self._px(PAD), free), y, text)
 
     def _walls(self, draw: "ImageDraw", view: View, place: tuple[int, int]) -> None:
         """Draw the walls just outside of the domain, so that nothing inside is hidden.

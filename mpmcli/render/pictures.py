@@ -171,12 +171,8 @@ class PlannedPicture:
     made: bool  # whether the file exists with this digest
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """Numbers of particles of a frame whose value is not a number, and of those without a place."""
-
-    missing: int
-    lost: int
+# Numbers of particles of a frame whose value is not a number, and of those without a place.
+Outcome = tuple[int, int]
 
 
 @dataclass(frozen=True)
@@ -221,16 +217,12 @@ class PictureRenderer:
                 frame = setup.result.present_frame(k, self._painter.fields)
             drawn.append(self._painter.draw(frame))
             times.append(frame.time)
-            outcome = Outcome(self._missing(frame), int((~np.isfinite(frame.position).all(axis=1)).sum()))
-            missing += outcome.missing
-            watch(k, outcome)
+            unknown, colors = 0, setup.colors
+            if isinstance(colors, Coloring) and setup.settings.mode != "density":
+                unknown = int((~np.isfinite(colors.values(frame))).sum())
+            missing += unknown
+            watch(k, (unknown, int((~np.isfinite(frame.position).all(axis=1)).sum())))
         return setup.layout.compose(drawn, setup.view, times, missing, captions)
-
-    def _missing(self, frame: Frame) -> int:
-        colors = self._setup.colors
-        if not isinstance(colors, Coloring) or self._setup.settings.mode == "density":
-            return 0
-        return int((~np.isfinite(colors.values(frame))).sum())
 
 
 def picture_digest(result: Result, settings: Settings, ks: Sequence[int]) -> str:

@@ -5,7 +5,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -17,9 +17,6 @@ from mpmcli.output.result import Result, open_result
 from mpmcli.processes.pool import render_frames
 from mpmcli.render.particle_grid import FINENESS, Grid, blurred_along, cover_of, drawable, with_images
 from mpmcli.render.render_scene import RenderScene, groups_of, render_scene_of
-
-if TYPE_CHECKING:
-    import pyvista as pv
 
 # Smoothing length of the kernel of splashsurf, in particle radii, share of the full density at which the surface lies,
 # and rounds of Laplacian smoothing, weighted so that thin sheets keep their volume.
@@ -97,7 +94,11 @@ def reconstruct(
     order = np.lexsort(vertices.T)
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
-    triangles = _ordered(rank[faces.astype(np.int64)], len(order))
+    triangles = rank[faces.astype(np.int64)]
+    # The lowest vertex of each comes first, and they are sorted.
+    turn = triangles.argmin(axis=1)[:, None]
+    triangles = np.take_along_axis(triangles, (turn + np.arange(3)) % 3, axis=1)
+    triangles = triangles[np.argsort(triangles[:, 0] * len(order) + triangles[:, 1], kind="stable")]
     # These are views of the mesh's own memory.
     vertices[:], faces[:] = vertices[order], triangles
     weights, connectivity = _fullness(points, vertices), mesh.vertex_vertex_connectivity()
@@ -177,13 +178,6 @@ def _fullness(points: np.ndarray, vertices: np.ndarray) -> np.ndarray:
     at = np.clip(((vertices - low) / edge).astype(int) + 1, 0, np.array(shape) - 1)
     slope = np.clip((share[tuple(at.T)] - ALONE) / (HALF - ALONE), 0.0, 1.0)
     return (slope * slope * (3.0 - 2.0 * slope)).astype(np.float32)
-
-
-def _ordered(triangles: np.ndarray, count: int) -> np.ndarray:
-    """Turn each triangle so that its lowest vertex comes first, and sort them."""
-    turn = triangles.argmin(axis=1)[:, None]
-    turned = np.take_along_axis(triangles, (turn + np.arange(3)) % 3, axis=1)
-    return turned[np.argsort(turned[:, 0] * count + turned[:, 1], kind="stable")]
 
 
 def surface_paths(scene: RenderScene, directory: Path, index: int) -> list[Path]:
@@ -309,22 +303,15 @@ def _joined(meshes: Sequence[Mesh]) -> Mesh:
     return Mesh(points, np.concatenate(triangles), normals)
 
 
-def poly_data(mesh: Mesh) -> "pv.PolyData":
-    """Return a mesh as PyVista's, with its normals."""
-    import pyvista as pv
-
-    if not len(mesh.points):
-        return pv.PolyData()
-    data = pv.PolyData.from_regular_faces(mesh.points, mesh.triangles)
-    data.point_data["Normals"] = mesh.normals
-    data.GetPointData().SetActiveNormals("Normals")
-    return data
-
-
 def _write_vtp(path: Path, mesh: Mesh, time: float) -> None:
+    import pyvista as pv
     import vtk
 
-    data = poly_data(mesh)
+    data = pv.PolyData()
+    if len(mesh.points):
+        data = pv.PolyData.from_regular_faces(mesh.points, mesh.triangles)
+        data.point_data["Normals"] = mesh.normals
+        data.GetPointData().SetActiveNormals("Normals")
     data.field_data["TimeValue"] = np.array([time])
     with sealed(path) as temporary:
         writer = vtk.vtkXMLPolyDataWriter()

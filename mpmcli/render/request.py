@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +11,15 @@ from mpmcli.errors import InputError
 from mpmcli.output.result import Result
 from mpmcli.plain_text import counted
 from mpmcli.render.coloring import Coloring
-from mpmcli.render.film import check_film, film_digest, write_film
 from mpmcli.render.frame_choice import choose_frames, evenly_spaced
-from mpmcli.render.picture_file import require_writable, settings_digest, write_picture
+from mpmcli.render.picture_file import (
+    check_film,
+    film_digest,
+    require_writable,
+    settings_digest,
+    write_film,
+    write_picture,
+)
 from mpmcli.render.pictures import (
     FOREIGN,
     Outcome,
@@ -88,16 +95,13 @@ class RenderPlan:
     setup: RenderSetup  # shared by all pictures
     ks: list[int]  # positions of the frames in the result
     plan: list[PlannedPicture]  # the picture files, one for each frame; one for a montage
-    movie: Path | None
-    fps: float
-    save_surface: Path | None
-    overwrite: bool
+    request: Request
 
     @property
     def due(self) -> int:
         """Number of frames that have to be drawn, or their surfaces written."""
         frames = len(self.ks) if self._is_montage else 1
-        return sum(frames for planned in self.plan if not planned.made) + len(self.ks) * (self.save_surface is not None)
+        return sum(frames for planned in self.plan if not planned.made) + len(self.ks) * bool(self.request.save_surface)
 
     @property
     def _is_montage(self) -> bool:
@@ -110,27 +114,20 @@ class RenderPlan:
         watch: Callable[[int], None] = lambda done: None,
         stop: Callable[[], bool] = lambda: False,
     ) -> RenderSummary:
-        """Draw the missing pictures, and write the film.
+        """Draw the missing pictures, in as many processes as cores for None, and write the film.
 
-        Args:
-            workers: processes at a time, as many as cores for None.
-            watch: called with the number of frames drawn so far.
-            stop: polled; true ends the work.
-
-        Raises:
-            InputError: no OpenGL window opens on this machine, or a file cannot be written.
-            RunError: a process crashed, or the disk is full.
-            KeyboardInterrupt: `stop` returned true; finished pictures stay.
+        `watch` is called with the number of frames drawn so far; `stop` is polled, and true ends the work by a
+        KeyboardInterrupt, finished pictures stay. InputError: no OpenGL window opens on this machine, or a file cannot
+        be written; RunError: a process crashed, or the disk is full.
         """
         workers = workers or available_cores()
         source, settings = self.setup.result.path, self.setup.settings
+        movie, surface, rate = self.request.movie, self.request.save_surface, self.request.rate
         outcomes: dict[int, Outcome] = {}
-        done = 0
+        numbers = count(1)
 
         def seen(k: int, outcome: Outcome | None) -> None:
-            nonlocal done
-            done += 1
-            watch(done)
+            watch(next(numbers))
             if outcome is not None:
                 outcomes[k] = outcome
 
@@ -147,16 +144,15 @@ class RenderPlan:
         elif not self.plan[0].made:
             picture = PictureRenderer(self.setup).picture(self.ks, seen_here)
             write_picture(self.plan[0].path, picture, self.plan[0].digest)
-        if self.save_surface is not None:
-            save_surfaces(self.setup.result, self.ks, self.save_surface, workers, watch=seen, stop=stop)
-        if self.movie is not None:
-            digest = settings_digest({"pictures": [planned.digest for planned in self.plan], "fps": self.fps})
-            if self.overwrite or film_digest(self.movie) != digest:
-                pictures = [planned.path for planned in self.plan]
-                write_film(pictures, self.movie, self.fps, digest=digest, watch=check_stop)
-        made = sum(not planned.made for planned in self.plan)
+        if surface is not None:
+            save_surfaces(self.setup.result, self.ks, surface, workers, watch=seen, stop=stop)
         paths = [planned.path for planned in self.plan]
-        return RenderSummary(paths, made, self.movie, self.save_surface, self._warnings(outcomes))
+        if movie is not None:
+            digest = settings_digest({"pictures": [planned.digest for planned in self.plan], "fps": rate})
+            if self.request.overwrite or film_digest(movie) != digest:
+                write_film(paths, movie, rate, digest=digest, watch=check_stop)
+        made = sum(not planned.made for planned in self.plan)
+        return RenderSummary(paths, made, movie, surface, self._warnings(outcomes))
 
     def _warnings(self, outcomes: dict[int, Outcome]) -> list[str]:
         """Return sentences on particles that could not be drawn, one for all frames."""
@@ -167,10 +163,10 @@ class RenderPlan:
             return f"of {upto}{counted(most, 'particle')} is not a number, first in frame {first}"
 
         warnings, colors = [], self.setup.colors
-        missing = {k: outcome.missing for k, outcome in outcomes.items() if outcome.missing}
+        missing = {k: missing for k, (missing, _) in outcomes.items() if missing}
         if missing and isinstance(colors, Coloring):
             warnings.append(f"the {colors.name} {first_of(missing)}: drawn in {colors.missing}")
-        lost = {k: outcome.lost for k, outcome in outcomes.items() if outcome.lost}
+        lost = {k: lost for k, (_, lost) in outcomes.items() if lost}
         if lost:
             warnings.append(f"the position {first_of(lost)}: not drawn")
         return warnings
@@ -221,7 +217,7 @@ def plan_render(result: Result, request: Request, captions: tuple[str, ...] = ()
     for path in (plan[0].path, request.movie, surface):
         if path is not None:
             require_writable(path)
-    return RenderPlan(setup, ks, plan, request.movie, request.rate, request.save_surface, request.overwrite)
+    return RenderPlan(setup, ks, plan, request)
 
 
 def _require_sense(request: Request) -> None:

@@ -39,7 +39,7 @@ class SurfaceRenderer:
         self.background = Background(scene, view, theme)
         self.lamp = lighting.lights_of(scene, view, theme)["lampTo"]
         self.window = OffscreenRenderer(view, theme, samples=FINER if FINER * max(view.size) <= LONGEST else 1)
-        self.window.add_box(scene.lower, scene.upper, theme.wall, width=1.3)
+        self.window.add_box(scene, width=1.3)
         self.renderer = self.window.plotter.renderer
         self.behind, self.background_texture = (_texture(self.background.image(None)) for _ in range(2))
         self.renderer.SetBackgroundTexture(self.background_texture)
@@ -69,16 +69,14 @@ class SurfaceRenderer:
             for actor in clear:
                 actor.SetVisibility(False)
             self.window.render()
-            _put(self.behind, np.concatenate([self.window.pixels(), self._nearness()], axis=2))
+            # Its depth from 0, near, to 255, far and nothing.
+            share = (self.window.depth() - self.view.near) / (self.view.far - self.view.near)
+            nearness = (255 * np.clip(share, 0, 1)).astype(np.uint8)
+            _put(self.behind, np.dstack([self.window.pixels(), nearness]))
             for actor in clear:
                 actor.SetVisibility(True)
         self.window.render()
         return self.window.picture()
-
-    def _nearness(self) -> np.ndarray:
-        """Return the depth of what is drawn, (h, w, 1) uint8 from 0, near, to 255, far and nothing."""
-        share = (self.window.depth() - self.view.near) / (self.view.far - self.view.near)
-        return (255 * np.clip(share, 0, 1)).astype(np.uint8)[..., None]
 
     def _posed(self, group: Group, frame: Frame, occlusion: Occlusion) -> Any:
         """Return the actor of a group, with the mesh of this frame."""

@@ -17,9 +17,7 @@ def choose_window() -> str:
     """Return the class of window that VTK draws with off screen, here and in processes started from here.
 
     The user's VTK_DEFAULT_OPENGL_WINDOW is kept. Otherwise it is EGL on Linux, or OSMesa where EGL does not work.
-
-    Raises:
-        InputError: no window opens.
+    InputError: no window opens.
     """
     given = os.environ.get(SETTING, "").strip()
     if sys.platform == "linux":

@@ -201,25 +201,19 @@ def reaching(source: Body | Emitter, scene: Scene) -> list[Body | Emitter]:
     A solid that rests less than a cell above the lowest point of the domain does none of that, if no force acts on it.
     Colliders and walls that move count by their speed alone (`scene_bounds`), whatever they push.
     """
-    impelled = {force.body for force in scene.pushes}
-    return [
-        other
-        for other in scene.sources
-        if other is source
-        or not (isinstance(other, Body) and other.material.solid)
-        or impelled & {None, other.name}
-        or highest_speed(other) > 0
-        or not _stands(other, scene)
-    ]
-
-
-def _stands(body: Body, scene: Scene) -> bool:
-    """Return whether a body lies less than a cell above the lowest point of the domain, or nothing pulls."""
     gravity, periodic = scene.domain.gravity_at(0.0), np.array(scene.domain.periodic)
-    if not scene.domain.steady or gravity[periodic].any():
-        return False
-    corners = _corners(*body.shape.form.bounds())
-    return not gravity.any() or float(np.min(_falls(scene, corners, gravity))) < scene.domain.spacing
+    steady = scene.domain.steady and not gravity[periodic].any()
+    impelled = {force.body for force in scene.pushes}
+    found = []
+    for other in scene.sources:
+        solid = isinstance(other, Body) and other.material.solid
+        stands = steady and solid and not (impelled & {None, other.name} or highest_speed(other) > 0)
+        if stands and gravity.any():
+            above = _falls(scene, _corners(*other.shape.form.bounds()), gravity)
+            stands = float(np.min(above)) < scene.domain.spacing
+        if other is source or not stands:
+            found.append(other)
+    return found
 
 
 def scene_bounds(scene: Scene, sources: Sequence[Body | Emitter] | None = None) -> SceneBounds:
@@ -255,7 +249,8 @@ def scene_bounds(scene: Scene, sources: Sequence[Body | Emitter] | None = None) 
     closed = ~np.array(scene.domain.periodic)
     corners = np.concatenate([_corners(*body.shape.form.bounds()) for body in sources])
     if any((gravity * closed).any() for gravity in gravities):
-        height = max(_height(scene, corners, gravity * closed) for gravity in gravities if (gravity * closed).any())
+        pulling = [gravity * closed for gravity in gravities if (gravity * closed).any()]
+        height = max(0.0, *(float(np.max(_falls(scene, corners, gravity))) for gravity in pulling))
     else:
         height = float(np.max(np.ptp(corners, axis=0)))
     # What presses on no face pulls as long as the run.
@@ -282,22 +277,19 @@ def highest_speed(body: Body | Emitter) -> float:
     """
     if isinstance(body, Emitter):
         return float(np.linalg.norm(body.velocity))
-    own = _speed_of_table(body)
-    if isinstance(form := body.shape.form, Points) and form.file_velocity is not None:
-        return own + float(np.linalg.norm(form.file_velocity, axis=1).max())
-    return own
-
-
-def _speed_of_table(body: Body) -> float:
+    form, velocity = body.shape.form, body.velocity
     if moves_unevenly(body):
         speeds = np.linalg.norm(initial_motion(body, body_points(body))[0], axis=1)
-        return float(np.max(speeds, initial=0.0, where=np.isfinite(speeds)))
-    velocity = np.array(body.velocity)
-    if body.velocity_gradient is None:
-        return float(np.linalg.norm(velocity))
-    lower, upper = body.shape.form.bounds()
-    offsets = _corners(lower, upper) - (lower + upper) / 2
-    return float(np.max(np.linalg.norm(velocity + offsets @ np.array(body.velocity_gradient).T, axis=1)))
+        speed = float(np.max(speeds, initial=0.0, where=np.isfinite(speeds)))
+    elif body.velocity_gradient is None:
+        speed = float(np.linalg.norm(velocity))
+    else:
+        lower, upper = form.bounds()
+        offsets = _corners(lower, upper) - (lower + upper) / 2
+        speed = float(np.max(np.linalg.norm(velocity + offsets @ np.array(body.velocity_gradient).T, axis=1)))
+    if isinstance(form, Points) and form.file_velocity is not None:
+        speed += float(np.linalg.norm(form.file_velocity, axis=1).max())
+    return speed
 
 
 def body_points(body: Body) -> np.ndarray:
@@ -316,11 +308,6 @@ def body_places(body: Body, index: int, h: float) -> np.ndarray:
         return body_points(body)
     found = particle_places(body, index, h)
     return found if len(found) else body_points(body)
-
-
-def _height(scene: Scene, corners: np.ndarray, gravity: np.ndarray) -> float:
-    """Return how far the highest of some points lies above the lowest point of the domain, m, against gravity."""
-    return max(0.0, float(np.max(_falls(scene, corners, gravity))))
 
 
 def _falls(scene: Scene, corners: np.ndarray, gravity: np.ndarray) -> np.ndarray:

@@ -66,7 +66,15 @@ def emitter_problems(scene: Scene) -> Iterator[Problem]:
             yield Problem((*where, "start"), said)
             continue
         yield from (Problem((*where, key), said) for key, said in _emitted(emitter, scene))
-    yield from _unsuited(scene)
+    if scene.output.drop_retired and not scene.comes_and_goes:
+        said = "is for scenes with emitters or open faces, where particles come and go; leave it out"
+        yield Problem(("output", "drop_retired"), said)
+    opens = scene.domain.walls.any_open(scene.dimension)
+    found = [("emitters",)] * bool(scene.emitters) + [("domain", "walls")] * opens
+    if scene.solver.solids == "total" and found:
+        what = "emitters" if scene.emitters else "open faces"
+        said = f'solver.solids = "total" knows no {what}: give solids = "updated", or leave them out'
+        yield Problem(found[0], said)
 
 
 def _in_the_way(emitter: Emitter, places: np.ndarray, scene: Scene) -> Iterator[str]:
@@ -106,18 +114,6 @@ def _emitted(emitter: Emitter, scene: Scene) -> Iterator[tuple[str, str]]:
         yield "particles", f"would be {sheets.particles:.3g}, more than a run can number, {_MOST}; give fewer"
 
 
-def _unsuited(scene: Scene) -> Iterator[Problem]:
-    if scene.output.drop_retired and not scene.comes_and_goes:
-        said = "is for scenes with emitters or open faces, where particles come and go; leave it out"
-        yield Problem(("output", "drop_retired"), said)
-    opens = scene.domain.walls.any_open(scene.dimension)
-    found = [("emitters",)] * bool(scene.emitters) + [("domain", "walls")] * opens
-    if scene.solver.solids == "total" and found:
-        what = "emitters" if scene.emitters else "open faces"
-        said = f'solver.solids = "total" knows no {what}: give solids = "updated", or leave them out'
-        yield Problem(found[0], said)
-
-
 # Cells that a particle may lie inside of a collider: of round-off, and of curved surfaces that are given by chords.
 _SLACK = 0.1
 # Lattices above this size are not looked at.
@@ -152,11 +148,33 @@ def collider_problems(scene: Scene) -> Iterator[Problem]:
         unfit = list(_unfit(collider, k, scene.time.end))
         yield from unfit
         placed = placed and not unfit
-        if not unfit:
-            yield from _out_of_reach(collider, k, scene)
-            yield from _too_large(collider, k, scene)
-    if placed:
-        yield from _in_colliders(scene)
+        if unfit:
+            continue
+        yield from _out_of_reach(collider, k, scene)
+        # Its distances are computed at nodes.
+        if isinstance(collider.form, Mesh | Composite | Polygon):
+            spans = np.ptp(np.array(collider.form.bounds()), axis=0) / scene.domain.spacing
+            if not (count := float(np.prod(spans + 1))) <= _MOST_CELLS:
+                said = (
+                    f'"{collider.name}" spans {count:.3g} cells, and {_MOST_CELLS:g} is the most for meshes, polygons '
+                )
+                said += "and shapes of several; leave out what is out of reach"
+                yield Problem(("colliders", k, "shape"), said)
+    # Bodies of which a particle starts in a collider.
+    h = scene.domain.spacing
+    for i, body in enumerate(scene.bodies if placed and scene.colliders else ()):
+        if lattice_points(body, h) > _MOST_PLACES:
+            continue
+        places = particle_places(body, i, h)
+        for k, collider in enumerate(scene.colliders if len(places) else ()):
+            distance = collider.signed_distance(places)
+            if distance.min() < -_SLACK * h and not collider.holds:
+                where = place_text(places[distance.argmin()])
+                said = (
+                    f'body "{body.name}" overlaps collider "{collider.name}" at the start, for example at {where}; '
+                    "move one of them, or subtract the shape of the collider from that of the body"
+                )
+                yield Problem(("colliders", k, "shape"), said)
 
 
 def _unfit(collider: Collider, index: int, end: float) -> Iterator[Problem]:
@@ -186,33 +204,6 @@ def _out_of_reach(collider: Collider, index: int, scene: Scene) -> Iterator[Prob
         cure = "give its mesh scale = 0.001, if it is in millimetres" if collider.shape.files else "leave it out"
         said = f'collider "{collider.name}" ({spans} m) lies outside of the domain ({box} m); move it, or {cure}'
         yield Problem(("colliders", index, "shape"), said)
-
-
-def _too_large(collider: Collider, index: int, scene: Scene) -> Iterator[Problem]:
-    """Find colliders whose distances would be computed at too many nodes."""
-    if isinstance(collider.form, Mesh | Composite | Polygon):
-        spans = np.ptp(np.array(collider.form.bounds()), axis=0) / scene.domain.spacing
-        if not (count := float(np.prod(spans + 1))) <= _MOST_CELLS:
-            said = f'"{collider.name}" spans {count:.3g} cells, and {_MOST_CELLS:g} is the most for meshes, polygons '
-            yield Problem(("colliders", index, "shape"), said + "and shapes of several; leave out what is out of reach")
-
-
-def _in_colliders(scene: Scene) -> Iterator[Problem]:
-    """Find bodies of which a particle starts in a collider."""
-    h = scene.domain.spacing
-    for i, body in enumerate(scene.bodies if scene.colliders else ()):
-        if lattice_points(body, h) > _MOST_PLACES:
-            continue
-        places = particle_places(body, i, h)
-        for k, collider in enumerate(scene.colliders if len(places) else ()):
-            distance = collider.signed_distance(places)
-            if distance.min() < -_SLACK * h and not collider.holds:
-                where = place_text(places[distance.argmin()])
-                said = (
-                    f'body "{body.name}" overlaps collider "{collider.name}" at the start, for example at {where}; '
-                    "move one of them, or subtract the shape of the collider from that of the body"
-                )
-                yield Problem(("colliders", k, "shape"), said)
 
 
 # Cells from a wall beyond which no kernel of a body reaches it.
@@ -328,7 +319,7 @@ def _initial(scene: Scene) -> Iterator[Problem]:
     """Find deformations that do not fit their law, and what is not finite where a particle starts."""
     h = scene.domain.spacing
     for i, body in enumerate(scene.bodies):
-        misfits = [*_deformation_kind(body, scene.dimension), *_hydrostatic(body, scene)]
+        misfits = list(_misfits(body, scene))
         yield from (Problem(("bodies", i, key), said) for key, said in misfits)
         starts_unevenly = has_expressions(body) or body.initial_pressure is not None
         if not misfits and starts_unevenly and lattice_points(body, h) <= _MOST_SEARCHED:
@@ -336,23 +327,19 @@ def _initial(scene: Scene) -> Iterator[Problem]:
                 yield Problem(("bodies", i, *key), said)
 
 
-def _deformation_kind(body: Body, dimension: int) -> Iterator[tuple[str, str]]:
-    law, keeps_J = body.material.law, body.material.stores == "J"
-    if body.deformation is None or isinstance(body.deformation, tuple) != keeps_J:
-        return
-    if keeps_J:
-        yield "deformation", f"must be J, one number or expression, as the law {law} stores no more; found a matrix"
-    else:
-        rest = [[int(i == j) for j in range(dimension)] for i in range(dimension)]
-        yield "deformation", f"must be F, {dimension} rows such as {rest}, as the law {law} stores it; found one value"
-
-
-def _hydrostatic(body: Body, scene: Scene) -> Iterator[tuple[str, str]]:
+def _misfits(body: Body, scene: Scene) -> Iterator[tuple[str, str]]:
+    """Find a deformation that the law does not store, and a pressure that the depth does not set."""
+    law, keeps_J, d = body.material.law, body.material.stores == "J", scene.dimension
+    if body.deformation is not None and isinstance(body.deformation, tuple) == keeps_J:
+        rest = [[int(i == j) for j in range(d)] for i in range(d)]
+        right = "J, one number or expression" if keeps_J else f"F, {d} rows such as {rest}"
+        stored = "no more; found a matrix" if keeps_J else "it; found one value"
+        yield "deformation", f"must be {right}, as the law {law} stores {stored}"
     if body.initial_pressure is None:
         return
     key = "initial_pressure"
     if not body.material.hydrostatic:
-        yield key, f"is for fluids: the law {body.material.law} has no pressure that the depth alone sets"
+        yield key, f"is for fluids: the law {law} has no pressure that the depth alone sets"
     elif body.deformation is not None:
         yield key, "sets the deformation, which is given as well; leave one of them out"
     elif not scene.domain.steady:
@@ -415,7 +402,18 @@ def _total(scene: Scene) -> Iterator[Problem]:
     if len(names) > 1:
         said = f'"total" is for bodies of one law; found {listed(names, "and")}: give solids = "updated"'
         yield Problem(where, said)
-    yield from _too_close(scene)
+    # Bodies that share nodes at rest, which would hold them together.
+    h = scene.domain.spacing
+    bounds = [body.shape.form.bounds() for body in scene.bodies]
+    for j, (lower, upper) in enumerate(bounds):
+        for i, (other_lower, other_upper) in enumerate(bounds[:j]):
+            gap = float(np.maximum(lower - other_upper, other_lower - upper).max())
+            if gap < (_APART - _TOLERANCE) * h:
+                said = (
+                    f'"{scene.bodies[j].name}" begins {max(gap, 0.0):.4g} m from "{scene.bodies[i].name}", along the '
+                    f'axis on which they are farther apart; with solver.solids = "total" it must be {_APART * h:.4g} m'
+                )
+                yield Problem(("bodies", j, "shape"), said)
     for i, body in enumerate(scene.bodies):
         if not body.material.elastic:
             said = (
@@ -429,21 +427,6 @@ def _total(scene: Scene) -> Iterator[Problem]:
     if any(scene.domain.periodic):
         said = '"total" keeps bodies whole on a grid that does not repeat; give solids = "updated", or other walls'
         yield Problem(where, said)
-
-
-def _too_close(scene: Scene) -> Iterator[Problem]:
-    """Find bodies that share nodes at rest, which would hold them together."""
-    h = scene.domain.spacing
-    bounds = [body.shape.form.bounds() for body in scene.bodies]
-    for j, (lower, upper) in enumerate(bounds):
-        for i, (other_lower, other_upper) in enumerate(bounds[:j]):
-            gap = float(np.maximum(lower - other_upper, other_lower - upper).max())
-            if gap < (_APART - _TOLERANCE) * h:
-                said = (
-                    f'"{scene.bodies[j].name}" begins {max(gap, 0.0):.4g} m from "{scene.bodies[i].name}", along the '
-                    f'axis on which they are farther apart; with solver.solids = "total" it must be {_APART * h:.4g} m'
-                )
-                yield Problem(("bodies", j, "shape"), said)
 
 
 def _nearly_held(body: Body, index: int, scene: Scene) -> Iterator[Problem]:

@@ -16,17 +16,7 @@ from mpmcli.scene.expression import Expression, Name, Tree, apply, derivative, e
 from mpmcli.scene.expression import Number as Constant
 from mpmcli.scene.primitives import rotation, unit
 from mpmcli.scene.quadrature import integral_of, largest_of
-from mpmcli.scene.quantity import (
-    NAME,
-    NotNegative,
-    Number,
-    Positive,
-    Table,
-    Vector,
-    direction_as,
-    flaw,
-    list_of_axes,
-)
+from mpmcli.scene.quantity import NAME, NotNegative, Number, Positive, Table, Vector, direction_as, flaw, list_of_axes
 from mpmcli.scene.rigid import Fixed, Hinge, Joint, Moments, Path, Posed, SpinAxis, Z, moments_of, turned_by, ways_of
 from mpmcli.scene.shapes import Form, Shape, exactly_one_form
 
@@ -214,15 +204,6 @@ class Collider(Table):
             raise flaw("must have times that rise from each to the next", "keyframes")
         if self.wall in ("stick", "hold") and self.friction > 0:
             raise flaw(f'is for a surface that slips or separates, and wall is "{self.wall}"; leave it out', "friction")
-        self._require_holding()
-        if self.free:
-            self._require_free()
-        elif self.fixed or self.joint:
-            raise flaw("is for one that moves freely; give its density or mass", "fixed" if self.fixed else "joint")
-        return self
-
-    def _require_holding(self) -> None:
-        """Refuse what only one that holds has, and what one that holds cannot have."""
         if self.axes is not None and not self.holds:
             raise flaw(f'is for wall = "hold", and wall is "{self.wall}"; leave it out', "axes")
         if self.axes is not None and (not self.axes or (len(self.velocity) == 2 and "z" in self.axes)):
@@ -231,6 +212,11 @@ class Collider(Table):
             )
         if self.holds and (self.free or self.side == "inside"):
             raise flaw('is "hold", which is for the inside of a shape that moves as the scene says', "wall")
+        if self.free:
+            self._require_free()
+        elif self.fixed or self.joint:
+            raise flaw("is for one that moves freely; give its density or mass", "fixed" if self.fixed else "joint")
+        return self
 
     def _require_free(self) -> None:
         """Refuse what a rigid body that moves freely cannot have."""
@@ -245,10 +231,7 @@ class Collider(Table):
         if varies(*self.velocity, self.angular_velocity):
             key = "velocity" if varies(*self.velocity) else "angular_velocity"
             raise flaw(f"must be a number, that at the start, where {given} lets it move freely", key)
-        self._require_ways(given)
-
-    def _require_ways(self, given: str) -> None:
-        """Refuse a start that a joint or what is fixed does not allow."""
+        # A start that a joint or what is fixed does not allow.
         d, hinged = len(self.velocity), isinstance(self.joint, Hinge)
         if self.fixed and (self.joint or not ways_of(d, self.fixed).size):
             both = '"joint" is given as well; leave one of them out'

@@ -1,6 +1,6 @@
 """The domain of a scene: a box of whole grid cells, gravity, and what its walls do."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
@@ -76,10 +76,6 @@ class Faces(Table):
             raise flaw("is a face of a 3D scene and this one is 2D; leave it out")
         return value
 
-    def of(self, face: str) -> Any:
-        """Return what is given for a face by its name, None where there is nothing."""
-        return getattr(self, face)
-
 
 class WallVelocity(Faces):
     """Velocity of each face that moves along itself: one that sticks, or that has friction."""
@@ -92,29 +88,10 @@ class WallVelocity(Faces):
     z_max: Velocity | None = Field(None, description="Of the upper face along z, m/s; 3D only.")
 
 
-def require_pairs(words: Mapping[str, str], cells: Sequence[int]) -> None:
-    for axis, count in zip(AXES, cells, strict=False):
-        pair = words[f"{axis}_min"], words[f"{axis}_max"]
-        if PERIODIC not in pair:
-            continue
-        if set(pair) != {PERIODIC}:
-            face, other = (f"{axis}_min", f"{axis}_max")[:: 1 if pair[0] == PERIODIC else -1]
-            raise flaw(
-                f'is "periodic" and {other} is "{words[other]}": material that leaves through one face enters through '
-                f'the other, so that both need "periodic"',
-                f"walls.{face}",
-            )
-        if count < FEWEST_PERIODIC_CELLS:
-            raise flaw(
-                f'has "periodic" for faces with {count} cells between them; they need at least {FEWEST_PERIODIC_CELLS}',
-                "walls",
-            )
-
-
 def require_grip(velocity: WallVelocity, words: Mapping[str, str], frictions: Mapping[str, float]) -> None:
     """Refuse the velocity of a wall through itself, and that of one which nothing holds to the material."""
     for face in words:
-        found = velocity.of(face)
+        found = getattr(velocity, face)
         if found is None:
             continue
         axis = AXES.index(face[0])
@@ -160,7 +137,7 @@ class Walls(Faces):
     def faces(self, dimension: int) -> tuple[tuple[Wall, Wall], ...]:
         """Return what the lower and the upper face along each axis do."""
         return tuple(
-            (self.of(f"{axis}_min") or self.default, self.of(f"{axis}_max") or self.default)
+            (getattr(self, f"{axis}_min") or self.default, getattr(self, f"{axis}_max") or self.default)
             for axis in AXES[:dimension]
         )
 
@@ -278,7 +255,7 @@ class Domain(Table):
     def _faces_that_belong_together(self) -> "Domain":
         words = self._words()
         for face, word in words.items():
-            if word in _NEVER_SLIP and self.friction.of(face) is not None:
+            if word in _NEVER_SLIP and getattr(self.friction, face) is not None:
                 raise flaw(
                     f'is for a wall that can slip, and domain.walls has "{word}" for {face}; leave it out, or give '
                     f'"slip" or "separate" there',
@@ -287,7 +264,21 @@ class Domain(Table):
         if self.friction.default > 0 and set(words.values()) <= {*_NEVER_SLIP}:
             found = " or ".join(f'"{word}"' for word in sorted({*words.values()}, reverse=True))
             raise flaw(f"is for walls that can slip, and domain.walls has {found} for all; leave it out", "friction")
-        require_pairs(words, self.cells)
+        for axis, count in zip(AXES, self.cells, strict=False):
+            pair = words[f"{axis}_min"], words[f"{axis}_max"]
+            if PERIODIC in pair and set(pair) != {PERIODIC}:
+                face, other = (f"{axis}_min", f"{axis}_max")[:: 1 if pair[0] == PERIODIC else -1]
+                raise flaw(
+                    f'is "periodic" and {other} is "{words[other]}": material that leaves through one face enters '
+                    f'through the other, so that both need "periodic"',
+                    f"walls.{face}",
+                )
+            if PERIODIC in pair and count < FEWEST_PERIODIC_CELLS:
+                raise flaw(
+                    f'has "periodic" for faces with {count} cells between them; they need at least '
+                    f"{FEWEST_PERIODIC_CELLS}",
+                    "walls",
+                )
         if self.wall_velocity is not None:
             require_grip(self.wall_velocity, words, dict(zip(words, sum(self.frictions, ()), strict=True)))
         return self
@@ -305,7 +296,7 @@ class Domain(Table):
         """Coefficients of friction of the lower and the upper face along each axis, 0 for one that never slips."""
         found = []
         for face, word in self._words().items():
-            own = self.friction.of(face)
+            own = getattr(self.friction, face)
             found.append(0.0 if word in _NEVER_SLIP else self.friction.default if own is None else own)
         return tuple(zip(found[::2], found[1::2], strict=True))
 
@@ -313,7 +304,7 @@ class Domain(Table):
     def wall_velocities(self) -> tuple[tuple[tuple[float, ...], tuple[float, ...]], ...]:
         """Velocities of the lower and the upper face along each axis, m/s."""
         still, given = (0.0,) * len(self.size), self.wall_velocity or WallVelocity()
-        found = [given.of(face) or still for face in self._words()]
+        found = [getattr(given, face) or still for face in self._words()]
         return tuple(zip(found[::2], found[1::2], strict=True))
 
     @property

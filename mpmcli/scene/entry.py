@@ -8,8 +8,7 @@ from keyword import iskeyword
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Discriminator, GetCoreSchemaHandler, GetJsonSchemaHandler, Tag
-from pydantic_core import CoreSchema, core_schema
+from pydantic import Discriminator, PlainSerializer, PlainValidator, Tag, ValidationInfo, WithJsonSchema
 
 from mpmcli.scene.expression import (
     CONSTANTS,
@@ -29,34 +28,20 @@ from mpmcli.scene.quantity import LARGEST, flaw, list_of_axes, scene_dimension
 Entry = float | Expression
 
 
-class EntryOf:
-    """Marks a value as a number or an expression of some names."""
+def entry_of(*names: str) -> Any:
+    """Return the type of a value that is a number, or an expression of some names."""
 
-    def __init__(self, *names: str) -> None:
-        self.names = names
-
-    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        return core_schema.with_info_plain_validator_function(
-            self.read, serialization=core_schema.plain_serializer_function_ser_schema(plain)
-        )
-
-    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
-        text = {"type": "string", "description": f"An expression of {', '.join(self.names)}."}
-        return {"anyOf": [{"type": "number"}, text]}
-
-    def read(self, value: object, info: core_schema.ValidationInfo) -> Entry:
+    def read(value: object, info: ValidationInfo) -> Entry:
         """Return the number, or the expression of a text; a text that depends on nothing is its number."""
-        if isinstance(value, Expression):
-            return value
         if isinstance(value, str):
             missing = () if scene_dimension(info) != 2 else (POSITION[2], INITIAL[2])
             try:
-                names = [name for name in self.names if name not in missing]
-                value = parse(value, names, info.context.get("constants", {}))
+                known = [name for name in names if name not in missing]
+                value = parse(value, known, info.context.get("constants", {}))
             except ExpressionError as error:
                 raise flaw(str(error)) from None
-            if isinstance(value, Expression):
-                return value
+        if isinstance(value, Expression):
+            return value
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise flaw(f"must be a number or an expression in quotes; found {written(value)}")
         if isinstance(value, float) and not math.isfinite(value):
@@ -65,6 +50,10 @@ class EntryOf:
             found = written(value) if isinstance(value, int) else f"{value:g}"
             raise flaw(f"is beyond what can be computed with, {LARGEST:g} at most; found {found}")
         return float(value)
+
+    text = {"type": "string", "description": f"An expression of {', '.join(names)}."}
+    schema = WithJsonSchema({"anyOf": [{"type": "number"}, text]})
+    return Annotated[Entry, PlainValidator(read), PlainSerializer(plain), schema]
 
 
 def plain(value: object) -> object:
@@ -98,9 +87,9 @@ def varies(*entries: Entry) -> bool:
     return any(isinstance(entry, Expression) for entry in entries)
 
 
-OfTime = Annotated[Entry, EntryOf("t")]
-OfPlace = Annotated[Entry, EntryOf("t", *POSITION, *INITIAL)]
-OfStart = Annotated[Entry, EntryOf(*INITIAL)]
+OfTime = entry_of("t")
+OfPlace = entry_of("t", *POSITION, *INITIAL)
+OfStart = entry_of(*INITIAL)
 
 TimeVector = list_of_axes(OfTime, zeros=True)
 PlaceVector = list_of_axes(OfPlace)
@@ -122,25 +111,23 @@ class Constants(dict[str, "float | str"]):
     def __hash__(self) -> int:  # type: ignore[override]
         return hash(tuple(self.items()))
 
-    @classmethod
-    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        return core_schema.with_info_plain_validator_function(
-            cls._read, serialization=core_schema.plain_serializer_function_ser_schema(dict)
-        )
 
-    @classmethod
-    def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
-        entry = {"anyOf": [{"type": "number"}, {"type": "string", "description": "An expression."}]}
-        return {"type": "object", "additionalProperties": entry}
+def _read_constants(value: object, info: ValidationInfo) -> Constants:
+    if not isinstance(value, dict):
+        raise flaw(f"must be a table of names, such as {{ depth = 0.3 }}; found {written(value)}")
+    _, faults = definitions(value, scene_dimension(info))
+    for name, sentence in faults.items():
+        raise flaw(sentence, name)
+    return Constants(value)
 
-    @classmethod
-    def _read(cls, value: object, info: core_schema.ValidationInfo) -> "Constants":
-        if not isinstance(value, dict):
-            raise flaw(f"must be a table of names, such as {{ depth = 0.3 }}; found {written(value)}")
-        _, faults = definitions(value, scene_dimension(info))
-        for name, sentence in faults.items():
-            raise flaw(sentence, name)
-        return cls(value)
+
+_CONSTANT = {"anyOf": [{"type": "number"}, {"type": "string", "description": "An expression."}]}
+ConstantTable = Annotated[
+    Constants,
+    PlainValidator(_read_constants),
+    PlainSerializer(lambda table: dict(table)),
+    WithJsonSchema({"type": "object", "additionalProperties": _CONSTANT}),
+]
 
 
 def definitions(table: object, dimension: int | None) -> tuple[dict[str, ast.expr], dict[str, str]]:

@@ -1,16 +1,50 @@
-"""Expands the material of a scene to the table of a law: presets are filled in, and knobs become parameters.
+"""Presets and laws: what a scene says of a material as the table of a law, both as plain data, and the JSON Schema.
 
-A material is written `"honey"`, `{ preset = "honey", thickness = 0.7, density = 1400 }`, or
-`{ law = "fluid", ... }`. What the scene says itself always wins over what its preset holds.
+A preset is a material by the name of the thing: a law and its parameters in SI units, each with its source, from
+presets.toml. A material is written `"honey"`, `{ preset = "honey", thickness = 0.7, density = 1400 }`, or
+`{ law = "fluid", ... }`. Presets are filled in, and knobs become parameters. What the scene says itself always wins
+over what its preset holds. With the JSON Schema of scenes editors complete them.
 """
 
 import copy
+import tomllib
 from dataclasses import dataclass, field
-from typing import Any
+from importlib.resources import files
+from itertools import combinations
+from typing import Any, Literal, NamedTuple
+
+from pydantic.json_schema import GenerateJsonSchema
 
 from mpmcli.scene.material import Knob, Laws, MaterialParameters, knobs_of, unit_of
-from mpmcli.scene.presets import PRESETS
 from mpmcli.scene.problem import Path, Problem, Renames, listed, nearest, quoted, written
+from mpmcli.scene.schema import scene_model
+
+
+class Value(NamedTuple):
+    """A parameter of a preset, and where its value comes from."""
+
+    value: float | bool | Literal["auto"]
+    source: str
+
+
+@dataclass(frozen=True)
+class Preset:
+    """One material: its law, what it looks like when it moves, and parameters; others have the law's default."""
+
+    law: str
+    shows: str
+    values: dict[str, Value]
+
+    @property
+    def parameters(self) -> dict[str, float | bool | Literal["auto"]]:
+        return {name: value for name, (value, _) in self.values.items()}
+
+
+_TABLES = tomllib.loads(files("mpmcli.scene").joinpath("presets.toml").read_text(encoding="utf-8"))
+PRESETS = {
+    name: Preset(table.pop("law"), table.pop("shows"), {key: Value(*value) for key, value in table.items()})
+    for name, table in _TABLES.items()
+}
 
 
 @dataclass
@@ -22,10 +56,6 @@ class Expansion:
     renames: Renames = field(default_factory=dict)  # path of each parameter that a knob set -> path of the knob
     faulty: set[Path] = field(default_factory=set)  # paths of the materials that are None
     notes: dict[tuple[str, int], list[str]] = field(default_factory=dict)  # what each knob did, by table and index
-
-    def hides(self, path: Path) -> bool:
-        """Say whether a path lies in a material that has its problem already."""
-        return any(path[: len(material)] == material for material in self.faulty)
 
 
 def expand_materials(data: dict[str, Any], laws: Laws) -> Expansion:
@@ -119,8 +149,12 @@ class _Material:
         result = {"law": law, **held, **own}
         for key in [key for key in said if key in knobs]:
             parameter, knob = knobs[key]
-            if sentence := _beside(knob, parameter, own):
-                self._fault((*self.path, key), sentence)
+            stronger = [
+                f"{other} = {written(own[other])}" for other in knob.excludes if own.get(other, "auto") != "auto"
+            ]
+            if parameter in own or stronger:
+                why = "is given as well" if parameter in own else f"{stronger[0]} overrules"
+                self._fault((*self.path, key), f"sets {parameter}, which {why}; leave one of them out")
                 continue
             result[parameter] = self._turned(knob, said[key], parameter, model, word if preset else "")
         return result
@@ -161,14 +195,176 @@ class _Material:
         self.expansion.problems.append(Problem(path, sentence))
 
 
-def _beside(knob: Knob, parameter: str, said: dict[str, Any]) -> str | None:
-    """Return what is wrong with a knob beside the parameters that the scene gives, or None."""
-    if parameter in said:
-        return f"sets {parameter}, which is given as well; leave one of them out"
-    overrules = (f"{other} = {written(said[other])}" for other in knob.excludes if said.get(other, "auto") != "auto")
-    first = next(overrules, None)
-    return f"sets {parameter}, which {first} overrules; leave one of them out" if first else None
-
-
 def _law_name(law: type[MaterialParameters]) -> str:
     return str(law.model_fields["law"].default)
+
+
+class _WithoutTitles(GenerateJsonSchema):
+    def field_title_should_be_set(self, schema: Any) -> bool:
+        """Leave out titles that only repeat the key."""
+        return False
+
+
+def json_schema(laws: Laws) -> dict[str, Any]:
+    """Return the JSON Schema (draft 2020-12) of a scene whose materials are of the given laws."""
+    schema = _without_null(scene_model(laws).model_json_schema(schema_generator=_WithoutTitles))
+    definitions = schema["$defs"]
+    presets = available_presets(laws)
+    forms: list[dict[str, Any]] = [_one_of(presets, "A preset as it is.")] if presets else []
+    for law in laws:
+        word = law.model_fields["law"].default
+        # The name that pydantic gave its table: that of its class, or longer where two classes share it.
+        own_law = {name: table.get("properties", {}).get("law", {}) for name, table in definitions.items()}
+        key = next(name for name, inner in own_law.items() if inner.get("const") == word)
+        table = definitions[key]
+        forms.append({"$ref": f"#/$defs/{key}"})
+        if own := [name for name in presets if PRESETS[name].law == word]:
+            name = key.removesuffix("Parameters") + "Presets"
+            definitions[name] = _preset_table(table, law, own, name)
+            forms.append({"$ref": f"#/$defs/{name}"})
+        _add_knobs(table, law)
+        # `law` has a default in Python; in a scene it selects the law.
+        table["required"] = ["law", *table.get("required", [])]
+    material = definitions["Body"]["properties"]["material"]
+    definitions["Body"]["properties"]["material"] = {"description": material["description"], "oneOf": forms}
+    definitions["Domain"]["oneOf"] = [{"required": ["spacing"]}, {"required": ["cells"]}]
+    schema["$defs"] = dict(sorted(definitions.items()))
+    # Not in the model of a scene: they are gone once it is read.
+    text = {"type": "string"}
+    base = {**text, "description": "Path of a scene that this one begins with; tables here are merged into its tables."}
+    remove = {"type": "array", "items": text, "description": "Names of what the base has and this scene has not."}
+    schema["properties"] |= {"base": base, "remove": remove}
+    schema["anyOf"] = [{"required": ["base"]}, {"required": schema.pop("required")}]
+    return {"$schema": GenerateJsonSchema.schema_dialect, **schema}
+
+
+def _one_of(presets: list[str], description: str) -> dict[str, Any]:
+    return {
+        "description": description,
+        "oneOf": [{"const": name, "description": PRESETS[name].shows} for name in presets],
+    }
+
+
+def _preset_table(
+    table: dict[str, Any], law: type[MaterialParameters], presets: list[str], name: str
+) -> dict[str, Any]:
+    """Return the table of a preset: nothing but its name is needed, and its values are the defaults."""
+    others = {
+        key: {word: value for word, value in inner.items() if word != "default"}
+        for key, inner in table["properties"].items()
+        if key != "law"
+    }
+    made = {
+        **table,
+        "title": name,
+        "description": f"A preset that follows the law {law.model_fields['law'].default}, with changes.",
+        "properties": {"preset": _one_of(presets, "Name of the preset."), **others},
+    }
+    made.pop("required", None)
+    _add_knobs(made, law)
+    made["required"] = ["preset"]
+    return made
+
+
+def _add_knobs(table: dict[str, Any], law: type[MaterialParameters]) -> None:
+    """Add the knobs of a law to the table of its parameters: either the knob or the parameter that it sets."""
+    required = table.get("required", [])
+    rules: list[dict[str, Any]] = []
+    for name, (parameter, knob) in knobs_of(law).items():
+        reach = knob.reach(unit_of(law.model_fields[parameter].description))
+        text = f"Knob, 0 to 1, that sets {parameter}: {reach}; {knob.meaning}."
+        entry = {"description": text, "type": "number", "minimum": 0, "maximum": 1}
+        table["properties"] = {**table["properties"], name: entry}
+        ways = [parameter, name, *(key for key, other in law.sets.items() if other == parameter)]
+        either = {"oneOf": [{"required": [way]} for way in ways]}
+        pairs = [{"not": {"required": list(pair)}} for pair in combinations(ways, 2)]
+        rules += [either] if parameter in required else pairs
+    table["required"] = [key for key in required if key not in {parameter for parameter, _ in knobs_of(law).values()}]
+    if rules:
+        table["allOf"] = rules
+
+
+def _without_null(schema: Any) -> Any:
+    """Drop null from a schema: TOML cannot write it, so it is only our word for "not given"."""
+    if isinstance(schema, list):
+        return [_without_null(entry) for entry in schema]
+    if not isinstance(schema, dict):
+        return schema
+    kept = {key: _without_null(value) for key, value in schema.items() if not (key == "default" and value is None)}
+    if {"type": "null"} in kept.get("anyOf", []):
+        others = [entry for entry in kept.pop("anyOf") if entry != {"type": "null"}]
+        kept |= others[0] if len(others) == 1 else {"anyOf": others}
+    return kept
+
+
+# JSON Schema's words for the ends of a range, and how they are written.
+_ENDS = {"minimum": ">=", "exclusiveMinimum": ">", "maximum": "<=", "exclusiveMaximum": "<"}
+
+
+def law_facts(model: type[MaterialParameters]) -> dict[str, Any]:
+    """Return a law's name, its parameters with unit, range and default, its knobs, and its internal variables."""
+    properties = model.model_json_schema(schema_generator=GenerateJsonSchema)["properties"]
+    return {
+        "name": model.model_fields["law"].default,
+        "parameters": [
+            {
+                "name": name,
+                "unit": unit_of(field.description),
+                "range": _range(properties[name]),
+                "default": None if field.is_required() else field.default,
+                "description": field.description or "",
+            }
+            for name, field in model.model_fields.items()
+            if name != "law"
+        ],
+        "knobs": knob_facts(model),
+        "fields": [
+            {"name": v.name, "description": v.description, "dimensions": list(v.dimensions)} for v in model.internal
+        ],
+    }
+
+
+def preset_facts(name: str, model: type[MaterialParameters]) -> dict[str, Any]:
+    """Return a preset's law, its values with their sources, and where its knobs stand; `model` is that of its law."""
+    preset = PRESETS[name]
+    return {
+        "name": name,
+        "law": preset.law,
+        "shows": preset.shows,
+        "values": [
+            {
+                "name": parameter,
+                "value": value,
+                "unit": unit_of(model.model_fields[parameter].description) if value != "auto" else "",
+                "source": source,
+            }
+            for parameter, (value, source) in preset.values.items()
+        ],
+        "knobs": knob_facts(model, preset.parameters),
+    }
+
+
+def knob_facts(model: type[MaterialParameters], values: dict[str, Any] | None = None) -> list[dict[str, Any]]:
+    """Return the knobs of a law: what each sets, on which scale, and where it stands for `values` or the defaults."""
+    facts = []
+    for name, (parameter, knob) in knobs_of(model).items():
+        field = model.model_fields[parameter]
+        value = (values or {}).get(parameter, field.default)
+        position = knob.position(value) if isinstance(value, int | float) else None
+        scale = {key: getattr(knob, key) for key in ("low", "high", "scale", "meaning")}
+        unit = unit_of(field.description)
+        facts.append({"name": name, "sets": parameter, "unit": unit, **scale, "position": position})
+    return facts
+
+
+def _range(schema: dict[str, Any]) -> str:
+    """Write what JSON Schema accepts: `> 0 or "auto"`, `> -1, < 0.5`, `true or false`."""
+    if "anyOf" in schema:
+        return listed([_range(one) for one in schema["anyOf"]])
+    if "const" in schema:
+        return written(schema["const"])
+    if "enum" in schema:
+        return listed([written(one) for one in schema["enum"]])
+    if schema.get("type") == "boolean":
+        return "true or false"
+    return ", ".join(f"{sign} {schema[word]:g}" for word, sign in _ENDS.items() if word in schema) or "any"

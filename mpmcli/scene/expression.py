@@ -323,10 +323,6 @@ def _power_slope(f: Tree, a: Tree, b: Tree, da: Tree, db: Tree) -> Tree:
     return plus(_chained(times(b, apply("**", a, minus(b, ONE))), da), _chained(times(f, apply("log", a)), db))
 
 
-def _choice_slope(f: Apply, _: Tree, first: Tree, second: Tree) -> Tree:
-    return first if first == second else Apply("if", (f.arguments[0], first, second))
-
-
 def _clamp_slope(f: Apply, *slopes: Tree) -> Tree:
     x, low, high = f.arguments
     risen = _extreme(">=", (x, low), slopes[:2])
@@ -365,10 +361,13 @@ def _truth_of(compute: Callable[..., np.ndarray], bounds: Callable, count: int =
 
 
 def _extreme_row(choose: np.ufunc, sign: str) -> Function:
-    def slope(f: Apply, *slopes: Tree) -> Tree:
-        return _extreme(sign, f.arguments, slopes)
-
-    return Function(lambda *values: reduce(choose, values), _extreme_of(choose), slope, least=2, most=MANY)
+    return Function(
+        lambda *values: reduce(choose, values),
+        _extreme_of(choose),
+        lambda f, *slopes: _extreme(sign, f.arguments, slopes),
+        least=2,
+        most=MANY,
+    )
 
 
 def _flat(u: Tree, f: Tree) -> Tree:
@@ -395,7 +394,9 @@ OPERATORS: dict[str, Function] = {
     "and": _truth_of(np.logical_and, _smallest),
     "or": _truth_of(np.logical_or, _largest),
     "not": _truth_of(np.logical_not, _not, 1),
-    "if": Function(np.where, _choice, _choice_slope, least=3, most=3),
+    "if": Function(
+        np.where, _choice, lambda f, _, a, b: a if a == b else Apply("if", (f.arguments[0], a, b)), least=3, most=3
+    ),
 }
 
 # Functions by the name that an expression calls.

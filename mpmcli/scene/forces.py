@@ -1,4 +1,4 @@
-"""What pushes bodies beside gravity: accelerations, forces, and pushes near a place."""
+"""What pushes bodies beside gravity: accelerations, forces, pushes near a place, and other bodies that they meet."""
 
 from typing import Literal
 
@@ -128,3 +128,28 @@ class Force(Table):
         names = ("t", *axes[0], *axes[1])
         entries = tuple(0.0 if text == "0.0" else parse(f"({text}){scale}{where}", names, {}) for text in texts)
         return self.model_copy(update={"acceleration": entries, "force": None, "region": None})
+
+
+class ContactPair(Table):
+    """What two bodies do to each other where they meet, whatever others do."""
+
+    between: tuple[str, str] = Field(description="Names of the two bodies.")
+    friction: NotNegative | Literal["stick"] = Field(
+        description='Coefficient of Coulomb friction between them, so that they separate; "stick": they do not.'
+    )
+
+
+class Contact(Table):
+    """What bodies do to each other where they meet."""
+
+    default: Literal["stick", "separate"] = Field(
+        "stick",
+        description='"stick": bodies share one velocity field, meet up to two cells before they touch, and do not '
+        'slide. "separate": each elastic body has a velocity field of its own; they meet each other, and walls and '
+        "colliders that separate, where their surfaces are, slide with friction, and part. Liquids, grains and bodies "
+        "that yield stick to all others.",
+    )
+    friction: NotNegative | None = Field(
+        None, description="Coefficient of Coulomb friction. Default: the softer body's, `surface_friction`."
+    )
+    pairs: tuple[ContactPair, ...] = Field((), description="Pairs of bodies that do something else.")

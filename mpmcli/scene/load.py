@@ -1,4 +1,7 @@
-"""From a TOML file to a complete scene, or to one error that names everything wrong with it."""
+"""From a TOML file to a complete scene, or to one error that names everything wrong with it.
+
+A scene may begin with another one: `base = "other.toml"`, and what of it is changed, added and removed.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,7 +13,6 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from mpmcli.errors import InputError
-from mpmcli.scene.base import read_scene
 from mpmcli.scene.bounds import body_places, reaching, scene_bounds
 from mpmcli.scene.checks import problems_in
 from mpmcli.scene.entry import definitions
@@ -20,18 +22,20 @@ from mpmcli.scene.problem import (
     Path,
     Problem,
     Renames,
+    hint_at,
     known_keys,
     nearest,
     nearest_entry,
     path_in,
     path_text,
     problems_of,
+    quoted,
     value_at,
 )
 from mpmcli.scene.quantity import dimension_of
 from mpmcli.scene.sampling import points_per_cell
 from mpmcli.scene.schema import Scene, scene_model
-from mpmcli.scene.toml_file import apply_overrides, copied, key_lines, line_of
+from mpmcli.scene.toml_file import apply_overrides, copied, key_lines, line_of, read_toml
 
 
 def repaired(
@@ -124,10 +128,26 @@ def parse_scene(
         InputError: as for `load_scene`.
     """
     data, overridden = apply_overrides(data, overrides)
-    scene, problems, notes = _validate(data, laws, directory)
+    scene, problems, knobs = _validate(data, laws, directory)
     if problems or scene is None:
         raise InputError(report(problems, source, text, overridden))
-    return _resolve(scene, notes, source)
+    # Set the "auto" parameters of every material from the speeds and pressures that can reach its body.
+    scene = _with_accelerations(scene)
+    whole = scene_bounds(scene)
+    resolved, notes = {}, []
+    for table in ("bodies", "emitters"):
+        found = []
+        for i, body in enumerate(getattr(scene, table)):
+            others = reaching(body, scene)
+            bounds = whole if len(others) == len(scene.sources) else scene_bounds(scene, others)
+            material, sentences = body.material.resolve(bounds)
+            changes: dict[str, object] = {"material": material}
+            if table == "bodies":
+                changes["particles_per_cell"] = points_per_cell(body, scene.domain.spacing)
+            found.append(body.model_copy(update=changes))
+            notes += [f"{body.name}: {sentence}" for sentence in (*knobs.get((table, i), []), *sentences)]
+        resolved[table] = tuple(found)
+    return LoadedScene(scene.model_copy(update=resolved), tuple(notes), source)
 
 
 def scene_problems(data: dict[str, Any], laws: Laws, directory: str | PathLike[str] = ".") -> list[Problem]:
@@ -157,33 +177,14 @@ def _validate(
             scene = model.model_validate(expansion.data, context=context)
         except ValidationError as error:
             unknown = [one["loc"] for one in error.errors() if one["type"] == "extra_forbidden"]
-            found = [p for p in problems_of(error, expansion.data, model) if not expansion.hides(p.path)]
+            # What lies in a faulty material has its problem already.
+            found = [p for p in problems_of(error, expansion.data, model) if p.path[:3] not in expansion.faulty]
         if not unknown:
             found += expansion.problems + (problems_in(scene) if scene is not None else [])
             return scene, problems + _as_written(found, expansion.renames, renames), expansion.notes
         unknown_paths, data, new = repaired(data, unknown, model)
         problems += _as_written([p for p in found if p.path in unknown_paths], expansion.renames, renames)
         renames = {**renames, **{p: original_path(old, renames) for p, old in new.items()}}
-
-
-def _resolve(scene: Scene, knobs: dict[tuple[str, int], list[str]], source: str) -> LoadedScene:
-    """Set the "auto" parameters of every material from the speeds and pressures that can reach its body."""
-    scene = _with_accelerations(scene)
-    whole = scene_bounds(scene)
-    resolved, notes = {}, []
-    for table in ("bodies", "emitters"):
-        found = []
-        for i, body in enumerate(getattr(scene, table)):
-            others = reaching(body, scene)
-            bounds = whole if len(others) == len(scene.sources) else scene_bounds(scene, others)
-            material, sentences = body.material.resolve(bounds)
-            changes: dict[str, object] = {"material": material}
-            if table == "bodies":
-                changes["particles_per_cell"] = points_per_cell(body, scene.domain.spacing)
-            found.append(body.model_copy(update=changes))
-            notes += [f"{body.name}: {sentence}" for sentence in (*knobs.get((table, i), []), *sentences)]
-        resolved[table] = tuple(found)
-    return LoadedScene(scene.model_copy(update=resolved), tuple(notes), source)
 
 
 def _with_accelerations(scene: Scene) -> Scene:
@@ -220,3 +221,79 @@ def report(
         place = override[0] if override else source if line is None else f"{source}:{line}"
         rows.append(": ".join(filter(None, [place, path_text(problem.path), problem.sentence])))
     return "\n".join(rows)
+
+
+def read_scene(path: str | PathLike[str], seen: Sequence[File] = ()) -> tuple[str, dict[str, Any]]:
+    """Return the text of a scene and what it holds, merged with its base; the text is empty where it has one.
+
+    Raises:
+        InputError: a file cannot be read or is no TOML, a base is its own, or what is to be removed is not there.
+    """
+    text, data = read_toml(path)
+    name, remove = data.pop("base", None), data.pop("remove", [])
+    if name is None and not remove:
+        return text, data
+    if name is None:
+        raise InputError(f"{path}: base: missing key: the scene whose names `remove` leaves out")
+    if not isinstance(name, str):
+        raise InputError(f"{path}: base: must be the path of a scene in quotes; found {name!r}")
+    if not isinstance(remove, list) or not all(isinstance(one, str) for one in remove):
+        raise InputError(f"{path}: remove: must be a list of names in quotes; found {remove!r}")
+    file, seen = File(path).parent / name, (*seen, File(path).resolve())
+    if file.resolve() in seen:
+        raise InputError(f"{path}: base: {name} has this scene as its base in turn; give another one")
+    _, base = read_scene(file, seen)
+    lists = [value for value in base.values() if isinstance(value, list)]
+    named = {one.get("name") for entries in lists for one in entries if isinstance(one, dict)}
+    for one in remove:
+        if one not in named:
+            known = sorted(word for word in named if isinstance(word, str))
+            hint = hint_at(one, known, f"those of {name} are {', '.join(quoted(known)) or 'none'}")
+            raise InputError(f'{path}: remove: nothing has the name "{one}"; {hint}')
+    kept = {
+        key: [one for one in value if not isinstance(one, dict) or one.get("name") not in remove]
+        if isinstance(value, list)
+        else value
+        for key, value in base.items()
+    }
+    return "", merged(_moved(kept, File(name).parent), data)
+
+
+def merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+    """Return a table with changes: tables are merged, entries of lists by their names; all else is replaced.
+
+    A shape, and a material with a preset or a law of its own, replace those of the base.
+    """
+    result = dict(base)
+    for key, value in changes.items():
+        before = base.get(key)
+        if key == "material" and isinstance(before, str):
+            before = {"preset": before}
+        other = key == "material" and isinstance(value, dict) and value.keys() & {"preset", "law"}
+        if isinstance(value, dict) and isinstance(before, dict) and key != "shape" and not other:
+            result[key] = merged(before, value)
+        elif isinstance(value, list) and isinstance(before, list) and all(isinstance(one, dict) for one in value):
+            entries = result[key] = list(before)
+            places = {one.get("name"): k for k, one in enumerate(before) if isinstance(one, dict) and "name" in one}
+            for one in value:
+                if (k := places.get(one.get("name"))) is None:
+                    entries.append(one)
+                else:
+                    entries[k] = merged(entries[k], one)
+        else:
+            if key in ("cells", "spacing"):
+                result = {name: one for name, one in result.items() if name not in ("cells", "spacing")}
+            result[key] = value
+    return result
+
+
+def _moved(tree: Any, directory: File) -> Any:
+    """Return tables whose files are relative to a directory, as seen from where that is."""
+    if isinstance(tree, list):
+        return [_moved(one, directory) for one in tree]
+    if not isinstance(tree, dict):
+        return tree
+    return {
+        key: str(directory / value) if key == "file" and isinstance(value, str) else _moved(value, directory)
+        for key, value in tree.items()
+    }

@@ -1,8 +1,15 @@
-"""A body in the form of points from a file (CSV, NPY, PLY, VTU), each of which is a particle."""
+"""Points and triangles from a file, and a body in the form of points, each of which is a particle.
+
+By the ending of a file: CSV and NPY here, STL, OBJ and PLY by trimesh, and all others by PyVista. VTK ends the process
+where a binary PLY is cut off; trimesh raises. It refuses faces of different lengths in one, which meshio takes.
+"""
 
 import csv
+import io
+import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
@@ -10,27 +17,146 @@ from typing import Any
 import numpy as np
 from pydantic import Field, PrivateAttr, ValidationInfo, model_validator
 
-from mpmcli.scene.geometry_file import GeometryFileError, absence, file_version, read_geometry, scene_file
 from mpmcli.scene.primitives import Solid
 from mpmcli.scene.problem import hint_at, listed, quoted
 from mpmcli.scene.quantity import AXES, Positive, Table, Vector, flaw, scene_dimension
 
+# The endings of files that trimesh reads.
+_BY_TRIMESH = (".obj", ".ply", ".stl")
+
+
+@dataclass(frozen=True, eq=False)
+class Geometry:
+    """Points (n, 3) float64 and their arrays by name; vertices (k, 3) and triangles (m, 3) int64 of the surface."""
+
+    points: np.ndarray
+    vertices: np.ndarray
+    triangles: np.ndarray
+    arrays: dict[str, np.ndarray] = field(default_factory=dict)
+
+
+class GeometryFileError(Exception):
+    """Why a file is of no use, in words that follow its name; empty where it cannot be read."""
+
+
+def scene_file(name: str, info: ValidationInfo) -> Path:
+    """Return the path of a file that a scene names, which is relative to the directory of the scene."""
+    directory = info.context.get("directory") if isinstance(info.context, dict) else None
+    return Path(directory or ".") / name
+
+
+def file_version(path: Path) -> tuple[int, int]:
+    """Return what tells versions of a file apart: when it was changed, ns, and its bytes; zeros where there is none."""
+    try:
+        stat = path.stat()
+    # Of a name with a null character, ValueError.
+    except (OSError, ValueError):
+        return 0, 0
+    return stat.st_mtime_ns, stat.st_size
+
+
+def absence(path: Path) -> str:
+    """Say why there is no file at a path, "" where there is one."""
+    try:
+        return "" if path.is_file() else "it is no file" if path.exists() else "there is no such file"
+    # A name that is too long, or a directory that may not be read.
+    except (OSError, ValueError):
+        return "there is no such file"
+
+
+def read_geometry(path: Path) -> Geometry:
+    """Return the points and the triangles in a file, or raise a GeometryFileError."""
+    if fault := absence(path):
+        raise GeometryFileError(fault)
+    try:
+        # Readers print on the terminal.
+        with warnings.catch_warnings(), redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
+            warnings.simplefilter("ignore")
+            return _by_trimesh(path) if path.suffix.lower() in _BY_TRIMESH else _by_vtk(path)
+    # Of a damaged file readers raise almost anything; meshio even ends the process.
+    except (Exception, SystemExit):
+        raise GeometryFileError from None
+
+
+def _by_trimesh(path: Path) -> Geometry:
+    import trimesh
+
+    try:
+        found = trimesh.load(path, process=False, skip_materials=True)
+    except ValueError:
+        if path.suffix.lower() != ".ply":
+            raise
+        # A binary PLY whose faces have different numbers of corners: each is a fan of triangles.
+        from meshio import ply
+
+        mesh = ply.read(path)
+        fans = [block.data[:, [0, k, k + 1]] for block in mesh.cells for k in range(1, block.data.shape[1] - 1)]
+        points = np.array(mesh.points, np.float64)
+        return Geometry(points, points, np.concatenate(fans).astype(np.int64))
+    if isinstance(found, trimesh.Scene):
+        found = found.to_mesh()
+    vertices, triangles = np.array(found.vertices, np.float64), getattr(found, "faces", np.empty((0, 3), np.int64))
+    if triangles.size and not 0 <= triangles.min() <= triangles.max() < len(vertices):
+        raise ValueError("a corner is no vertex")
+    # Corners of STL, and those of OBJ that have several texture coordinates, are one point.
+    first = np.unique(vertices, axis=0, return_index=True)[1]
+    points = vertices if path.suffix.lower() == ".ply" else vertices[np.sort(first)]
+    return Geometry(points, vertices, np.array(triangles))
+
+
+def _by_vtk(path: Path) -> Geometry:
+    """Return what PyVista reads, with the surface of solid cells."""
+    import pyvista as pv
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+    from vtkmodules.vtkCommonCore import vtkLogger, vtkObject
+    from vtkmodules.vtkFiltersCore import vtkTriangleFilter
+    from vtkmodules.vtkFiltersGeometry import vtkDataSetSurfaceFilter
+
+    shown, told = vtkObject.GetGlobalWarningDisplay(), vtkLogger.GetCurrentVerbosityCutoff()
+    vtkObject.GlobalWarningDisplayOff()
+    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)
+    try:
+        found = pv.read(path)
+        found = found.combine() if isinstance(found, pv.MultiBlock) else found
+        kinds = [found.GetCells()] if found.IsA("vtkUnstructuredGrid") else []
+        if found.IsA("vtkPolyData"):
+            kinds = [found.GetPolys(), found.GetStrips()]
+        for cells in kinds:
+            corners = vtk_to_numpy(cells.GetConnectivityArray())
+            if corners.size and not 0 <= corners.min() <= corners.max() < found.GetNumberOfPoints():
+                raise ValueError("a corner is no vertex")
+        surface, triangles = vtkDataSetSurfaceFilter(), vtkTriangleFilter()
+        surface.SetInputData(found)
+        triangles.SetInputConnection(surface.GetOutputPort())
+        triangles.PassVertsOff()
+        triangles.PassLinesOff()
+        triangles.Update()
+        result = triangles.GetOutput()
+    finally:
+        vtkObject.SetGlobalWarningDisplay(shown)
+        vtkLogger.SetStderrVerbosity(told)
+    points, data = np.array(found.points, np.float64), found.point_data
+    arrays = {str(name): np.asarray(data[name]) for name in data.keys()}  # noqa: SIM118
+    arrays = {name: array for name, array in arrays.items() if array.dtype.kind in "iuf"}
+    if not result.GetNumberOfPolys():
+        return Geometry(points, points[:0], np.empty((0, 3), np.int64), arrays)
+    vertices = vtk_to_numpy(result.GetPoints().GetData()).astype(np.float64)
+    corners = vtk_to_numpy(result.GetPolys().GetConnectivityArray()).reshape(-1, 3).astype(np.int64)
+    return Geometry(points, vertices, corners, arrays)
+
+
 TABLES = (".csv", ".npy")
 
 
-class PointFileError(Exception):
-    """A file holds no usable points; the text says why, in words that follow the name of the file."""
-
-
 def read_points(path: Path, d: int, velocity: str | Sequence[str] | None) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return the points in a file, (n, d), and the velocities it is asked for, (n, d), or None; or a PointFileError.
+    """Return the points in a file, (n, d), and the velocities it is asked for, (n, d), or None; or a GeometryFileError.
 
     It is a CSV whose first line names the columns, x, y (and z) among them; an NPY of named columns, or of d or 2 d
     unnamed ones, x, y, z, vx, vy, vz; or what `read_geometry` reads. `velocity` names the d columns of a table, or an
     array of a file that PyVista reads.
     """
     if fault := absence(path):
-        raise PointFileError(fault)
+        raise GeometryFileError(fault)
     table = path.suffix.lower() in TABLES
     fits = velocity is None or (
         len(velocity) == d and not isinstance(velocity, str) if table else isinstance(velocity, str)
@@ -39,7 +165,7 @@ def read_points(path: Path, d: int, velocity: str | Sequence[str] | None) -> tup
         right = (
             f"{d} columns, such as [{', '.join(quoted(_names(d)[d:]))}]" if table else 'an array, such as "velocity"'
         )
-        raise PointFileError(f"velocity must name {right}")
+        raise GeometryFileError(f"velocity must name {right}")
     if table:
         columns = _csv(path) if path.suffix.lower() == ".csv" else _npy(path, d)
         found = _chosen(columns, AXES[:d]), None if velocity is None else _chosen(columns, velocity)
@@ -47,9 +173,9 @@ def read_points(path: Path, d: int, velocity: str | Sequence[str] | None) -> tup
         found = _data_set(path, d, velocity)
     for values in found:
         if values is not None and not np.isfinite(values).all():
-            raise PointFileError(f"point {int(np.argmin(np.isfinite(values).all(axis=1))) + 1} is not finite")
+            raise GeometryFileError(f"point {int(np.argmin(np.isfinite(values).all(axis=1))) + 1} is not finite")
     if not len(found[0]):
-        raise PointFileError("it holds no point")
+        raise GeometryFileError("it holds no point")
     return found
 
 
@@ -61,7 +187,7 @@ def _chosen(columns: dict[str, np.ndarray], names: Sequence[str]) -> np.ndarray:
     for name in names:
         if name not in columns:
             hint = hint_at(name, list(columns), f"its columns are {listed(quoted(list(columns)), 'and')}")
-            raise PointFileError(f'it has no column "{name}"; {hint}')
+            raise GeometryFileError(f'it has no column "{name}"; {hint}')
     return np.stack([columns[name] for name in names], axis=1)
 
 
@@ -80,12 +206,12 @@ def _csv(path: Path) -> dict[str, np.ndarray]:
             names = [name.strip() for name in next(rows, [])]
             lines = [(rows.line_num, row) for row in rows if row]
     except (UnicodeDecodeError, csv.Error, OSError):
-        raise PointFileError("it is no text with comma-separated values") from None
+        raise GeometryFileError("it is no text with comma-separated values") from None
     if not names or any(_is_number(name) for name in names):
-        raise PointFileError("its first line must name the columns, such as x,y,z")
+        raise GeometryFileError("its first line must name the columns, such as x,y,z")
     for line, row in lines:
         if len(row) != len(names) or not all(map(_is_number, row)):
-            raise PointFileError(f"line {line} must hold {len(names)} numbers, one for each column")
+            raise GeometryFileError(f"line {line} must hold {len(names)} numbers, one for each column")
     values = np.array([row for _, row in lines], dtype=np.float64).reshape(-1, len(names))
     return dict(zip(names, values.T, strict=True))
 
@@ -96,11 +222,13 @@ def _npy(path: Path, d: int) -> dict[str, np.ndarray]:
         found = np.load(path, mmap_mode="r", allow_pickle=False)
     # Of a damaged header, Python's own tokenizer and parser raise almost anything.
     except Exception:
-        raise PointFileError("it is no array of numpy") from None
+        raise GeometryFileError("it is no array of numpy") from None
     if found.dtype.names:
         return {name: found[name].reshape(-1).astype(np.float64) for name in found.dtype.names}
     if found.ndim != 2 or found.shape[1] not in (d, 2 * d) or found.dtype.kind not in "fiu":
-        raise PointFileError(f"it must be of numbers, (n, {d}), or (n, {2 * d}) with velocities; it is {found.shape}")
+        raise GeometryFileError(
+            f"it must be of numbers, (n, {d}), or (n, {2 * d}) with velocities; it is {found.shape}"
+        )
     return dict(zip(_names(d), found.astype(np.float64).T, strict=False))
 
 
@@ -108,25 +236,25 @@ def _data_set(path: Path, d: int, velocity: str | None) -> tuple[np.ndarray, np.
     try:
         found = read_geometry(path)
     except GeometryFileError:
-        raise PointFileError("it is no file of points that can be read (CSV, NPY, PLY and VTU are)") from None
+        raise GeometryFileError("it is no file of points that can be read (CSV, NPY, PLY and VTU are)") from None
     if not len(found.points):
-        raise PointFileError("it holds no point")
+        raise GeometryFileError("it holds no point")
     position = _in_plane(found.points, d, "points")
     if velocity is None:
         return position, None
     if velocity not in found.arrays:
         known = listed(quoted(list(found.arrays)), "and") if found.arrays else "none"
-        raise PointFileError(f'its points have no array "{velocity}"; they have {known}')
+        raise GeometryFileError(f'its points have no array "{velocity}"; they have {known}')
     values = np.array(found.arrays[velocity], dtype=np.float64)
     if values.ndim != 2 or values.shape[1] not in (d, 3):
-        raise PointFileError(f'its array "{velocity}" must have {d} numbers for each point')
+        raise GeometryFileError(f'its array "{velocity}" must have {d} numbers for each point')
     return position, _in_plane(values, d, "velocities")
 
 
 def _in_plane(values: np.ndarray, d: int, what: str) -> np.ndarray:
     """Return vectors (n, 3) of a 2D scene without their z, which has to be the same for all."""
     if d < values.shape[1] and np.ptp(values[:, d]) > 0:
-        raise PointFileError(f"its {what} lie in space, and the scene is 2D; give points of one z")
+        raise GeometryFileError(f"its {what} lie in space, and the scene is 2D; give points of one z")
     return values[:, :d]
 
 
@@ -168,19 +296,16 @@ class Points(Table, Solid):
         path, d = scene_file(self.file, info), scene_dimension(info) or len(self.translate)
         try:
             self._cloud = _cloud_of(path.absolute(), file_version(path), d, self.velocity, self.scale, self.translate)
-        except PointFileError as error:
+        except GeometryFileError as error:
             raise flaw(f"{path}: {error}", "file") from None
         if (self.spacing is None) == (self.total_volume is None):
-            usual = self._usual_spacing()
-            hint = f"; its points are some {usual:.3g} m apart" if usual else ""
+            places, hint = self._cloud.position, ""
+            if len(places) > 1:
+                # Each from the nearest other one.
+                usual = float(np.median(self._cloud.tree.query(places[:10_000], k=2)[0][:, 1]))
+                hint = f"; its points are some {usual:.3g} m apart" if usual else ""
             raise flaw(f"needs either spacing or total_volume, which the mass of the body follows from{hint}")
         return self
-
-    def _usual_spacing(self) -> float:
-        """Return the median distance of a point to the nearest other one, m; 0 where there is none."""
-        if len(self._cloud.position) < 2:
-            return 0.0
-        return float(np.median(self._cloud.tree.query(self._cloud.position[:10_000], k=2)[0][:, 1]))
 
     @property
     def position(self) -> np.ndarray:

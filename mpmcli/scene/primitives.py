@@ -21,6 +21,12 @@ def grid_points(*axes: np.ndarray) -> np.ndarray:
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
 
 
+def box_corners(lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    """Return the corners of a box, (2^d, d); bit i of a corner's number is its side along axis i."""
+    d = len(lower)
+    return np.array([[upper[a] if k >> a & 1 else lower[a] for a in range(d)] for k in range(2**d)])
+
+
 def distance_to_segment(points: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Return the distance of each point, (n, d), from the segment between a and b, (d,) each: (n,), m."""
     t = np.clip((points - a) @ (b - a) / np.dot(b - a, b - a), 0.0, 1.0)
@@ -257,16 +263,13 @@ def _fault_of_polygon(vertices: np.ndarray) -> str:
     for i in range(n - 2):
         # Edges that share no vertex with edge i; the last edge is a neighbour of the first.
         others = np.arange(i + 2, n if i else n - 1)
-        if others.size and np.any(hit := _meet(vertices[i], ahead[i], vertices[others], ahead[others])):
+        a, b, c, d = vertices[i], ahead[i], vertices[others], ahead[others]
+        side_c, side_d = _cross(b - a, c - a), _cross(b - a, d - a)
+        side_a, side_b = _cross(d - c, a - c), _cross(d - c, b - c)
+        # Collinear segments have four zero sides, so their bounding boxes must meet as well.
+        boxes = np.all((np.minimum(c, d) <= np.maximum(a, b)) & (np.maximum(c, d) >= np.minimum(a, b)), axis=1)
+        hit = boxes & (np.sign(side_c) * np.sign(side_d) <= 0) & (np.sign(side_a) * np.sign(side_b) <= 0)
+        if np.any(hit):
             j = int(others[np.argmax(hit)])
             return f"the edges after vertices {i} and {j} cross or touch: list the vertices in order round the outline"
     return ""
-
-
-def _meet(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """Say which of the segments c-d, (n, 2) each, share a point with the segment a-b."""
-    side_c, side_d = _cross(b - a, c - a), _cross(b - a, d - a)
-    side_a, side_b = _cross(d - c, a - c), _cross(d - c, b - c)
-    # Collinear segments have four zero sides, so their bounding boxes must meet as well.
-    boxes = np.all((np.minimum(c, d) <= np.maximum(a, b)) & (np.maximum(c, d) >= np.minimum(a, b)), axis=1)
-    return boxes & (np.sign(side_c) * np.sign(side_d) <= 0) & (np.sign(side_a) * np.sign(side_b) <= 0)

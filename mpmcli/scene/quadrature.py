@@ -79,15 +79,10 @@ def parts_of(tree: Tree, start: float, end: float, *, precise: bool = True) -> P
     return Parts(*(np.concatenate(column)[order] for column in zip(*done, strict=True)))
 
 
-def _antiderivatives() -> np.ndarray:
-    """Return the integral from -1 of each node's Lagrange polynomial, as coefficients of powers, (NODES, NODES + 1)."""
-    powers = np.linalg.inv(np.vander(NODES, increasing=True)).T
-    integrals = np.concatenate([np.zeros((len(NODES), 1)), powers / np.arange(1, len(NODES) + 1)], axis=1)
-    integrals[:, 0] = -(integrals * (-1.0) ** np.arange(len(NODES) + 1)).sum(axis=1)
-    return integrals
-
-
-ANTIDERIVATIVES = _antiderivatives()
+# The integral from -1 of each node's Lagrange polynomial, as coefficients of powers, (NODES, NODES + 1).
+_POWERS = np.linalg.inv(np.vander(NODES, increasing=True)).T
+ANTIDERIVATIVES = np.concatenate([np.zeros((len(NODES), 1)), _POWERS / np.arange(1, len(NODES) + 1)], axis=1)
+ANTIDERIVATIVES[:, 0] = -(ANTIDERIVATIVES * (-1.0) ** np.arange(len(NODES) + 1)).sum(axis=1)
 
 
 # Columns of the rows of a window: start, middle and half length of a part, s; a bound on |value| in it; coefficients of
@@ -96,25 +91,19 @@ LOW, MIDDLE, HALF, BOUND, COEFFICIENTS = range(5)
 COLUMNS = COEFFICIENTS + len(NODES) + 1
 
 
-def window_rows(tree: Tree, start: float, end: float) -> np.ndarray:
-    """Return the integral of a tree of t from `start` to `end`, s, by the polynomials of its parts, (n, COLUMNS)."""
-    parts = parts_of(tree, start, end)
-    half = 0.5 * (parts.high - parts.low)
-    coefficients = parts.values @ ANTIDERIVATIVES * half[:, None]
-    before = np.concatenate([[0.0], np.cumsum(_rule(parts.values, parts.low, parts.high))[:-1]])
-    coefficients[:, 0] += before
-    low, high = (np.broadcast_to(side, half.shape) for side in bounds_of(tree, {"t": (parts.low, parts.high)}))
-    bound = np.maximum(np.abs(low), np.abs(high))
-    sampled = np.abs(np.where(np.isfinite(parts.values), parts.values, 0.0)).max(axis=1)
-    bound = np.where(np.isfinite(bound), bound, sampled)
-    return np.column_stack([parts.low, parts.low + half, half, bound, coefficients[:, ::-1]])
-
-
 class _Window:
-    """The integral of a tree of t from one time on."""
+    """The integral of a tree of t from one time on, by the polynomials of its parts: `rows`, (n, COLUMNS)."""
 
     def __init__(self, tree: Tree, start: float, end: float) -> None:
-        self.rows = window_rows(tree, start, end)
+        parts = parts_of(tree, start, end)
+        half = 0.5 * (parts.high - parts.low)
+        coefficients = parts.values @ ANTIDERIVATIVES * half[:, None]
+        coefficients[:, 0] += np.concatenate([[0.0], np.cumsum(_rule(parts.values, parts.low, parts.high))[:-1]])
+        low, high = (np.broadcast_to(side, half.shape) for side in bounds_of(tree, {"t": (parts.low, parts.high)}))
+        bound = np.maximum(np.abs(low), np.abs(high))
+        sampled = np.abs(np.where(np.isfinite(parts.values), parts.values, 0.0)).max(axis=1)
+        bound = np.where(np.isfinite(bound), bound, sampled)
+        self.rows = np.column_stack([parts.low, parts.low + half, half, bound, coefficients[:, ::-1]])
         self._low, self._middle, self._half = self.rows[:, [LOW, MIDDLE, HALF]].T.tolist()
         self._coefficients = self.rows[:, COEFFICIENTS:].tolist()
 
@@ -164,7 +153,7 @@ class Mean:
         return k * self._width
 
     def rows(self, k: int) -> np.ndarray:
-        """Return what a window consists of, see `window_rows`."""
+        """Return what a window consists of, (n, COLUMNS)."""
         return self._window(k).rows
 
     def _window(self, k: int) -> _Window:

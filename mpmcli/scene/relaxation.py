@@ -69,7 +69,7 @@ def relaxed(position: np.ndarray, volume: float, form: Form, domain: Domain) -> 
     lower, upper = np.clip(bounds, domain.origin, domain.upper)
     most, steps = _FARTHEST * share ** (1 / d), np.zeros(moving.shape)
     for _ in range(_DESCENTS[d]):
-        field = nodes.unfolded(weights * nodes.lack(rest + nodes.sums(moving, share)))
+        field = nodes.folded(weights * nodes.lack(rest + nodes.sums(moving, share)), back=True)
         for first in range(0, len(moving), _AT_ONCE):
             some = slice(first, first + _AT_ONCE)
             steps[some] = np.clip(_MOMENTUM * steps[some] + nodes.gradient(moving[some], field), -most, most)
@@ -116,18 +116,12 @@ class _Nodes:
                 if min(front + behind) >= 0 and max(front + behind) < self.counts[a]:
                     yield a, front, behind, sign
 
-    def folded(self, field: np.ndarray) -> np.ndarray:
-        """Add what lies beyond faces to the nodes that it is an image of, or the same as; in place."""
-        for a, front, behind, sign in self.folds:
+    def folded(self, field: np.ndarray, *, back: bool = False) -> np.ndarray:
+        """Add what lies beyond faces to the nodes that it is an image of, in place; `back` is the transpose."""
+        for a, front, behind, sign in reversed(self.folds) if back else self.folds:
             along = np.moveaxis(field, 1 + a, 0)
-            along[front] += sign * along[behind]
-        return field
-
-    def unfolded(self, field: np.ndarray) -> np.ndarray:
-        """Do the transpose of `folded`."""
-        for a, front, behind, sign in reversed(self.folds):
-            along = np.moveaxis(field, 1 + a, 0)
-            along[behind] += sign * along[front]
+            onto, beyond = (behind, front) if back else (front, behind)
+            along[onto] += sign * along[beyond]
         return field
 
     def weights(self, form: Form, sums: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import BeforeValidator, Field, ValidationInfo, model_validator
 
 from mpmcli.scene.entry import OfTime
-from mpmcli.scene.primitives import unit
+from mpmcli.scene.primitives import grid_points, unit
 from mpmcli.scene.quantity import AXES, Number, Positive, Table, Vector, direction_as, flaw, scene_dimension
 from mpmcli.scene.shapes import Form
 
@@ -43,7 +43,7 @@ def moments_of(form: Form, density: float | None, mass: float | None) -> Moments
     counts = np.ceil((upper - lower) / (upper - lower).max() * CELLS[d]).astype(int)
     size = (upper - lower) / counts
     axes = [lower[a] + size[a] * (np.arange(counts[a]) + 0.5) for a in range(d)]
-    x = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, d)
+    x = grid_points(*axes)
     masses = math.prod(size) * np.clip(0.5 - form.signed_distance(x) / size.min(), 0.0, 1.0)
     masses *= mass / masses.sum() if density is None else density
     mass = float(masses.sum())

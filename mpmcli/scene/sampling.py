@@ -16,9 +16,8 @@ from mpmcli.scene.primitives import Box
 from mpmcli.scene.problem import Path, path_text
 from mpmcli.scene.quantity import place_text
 from mpmcli.scene.relaxation import relaxed
-from mpmcli.scene.schema import Body, Emitter, Scene
+from mpmcli.scene.schema import Body, Scene
 from mpmcli.scene.sheets import sheets_of
-from mpmcli.scene.turned import turned_box, turned_points
 
 # Points per radius^d of a sample, as measured, in 2D and 3D. Without end it would be 0.6965 and 0.7334.
 DENSITY = {2: 0.680, 3: 0.652}
@@ -293,18 +292,16 @@ def sample_bodies(scene: Scene) -> list[BodyParticles]:
     Raises:
         InputError: a body is too thin for its lattice and gets no particle, or what it starts with is not finite there.
     """
-    bodies = [_sample(body, index, scene.domain) for index, body in enumerate(scene.bodies)]
-    return bodies + [_waiting(emitter, scene) for emitter in scene.emitters]
-
-
-def _waiting(emitter: Emitter, scene: Scene) -> BodyParticles:
-    """Return the particles of an emitter, sheet after sheet, at the places where they will enter."""
-    sheets = sheets_of(emitter, scene)
-    position = sheets.places(emitter)
-    n, d = position.shape
-    affine = np.broadcast_to(np.zeros((d, d)), (n, d, d))
-    mass = emitter.material.density * sheets.volume
-    return BodyParticles(emitter.name, position, np.zeros((n, d)), affine, sheets.volume, mass, waits=True)
+    found = [_sample(body, index, scene.domain) for index, body in enumerate(scene.bodies)]
+    for emitter in scene.emitters:
+        # Sheet after sheet, at the places where they will enter.
+        sheets = sheets_of(emitter, scene)
+        position = sheets.places(emitter)
+        n, d = position.shape
+        affine = np.broadcast_to(np.zeros((d, d)), (n, d, d))
+        mass = emitter.material.density * sheets.volume
+        found.append(BodyParticles(emitter.name, position, np.zeros((n, d)), affine, sheets.volume, mass, waits=True))
+    return found
 
 
 def estimate_particles(scene: Scene) -> int:
@@ -454,3 +451,46 @@ def _lattice(body: Body, index: int, h: float) -> Iterator[np.ndarray]:
         points = start + (cells + offset) * spacing
         # Round-off may carry a point of a box past a face by one unit in the last place.
         yield np.clip(points, lower, upper) if isinstance(body.shape.form, Box) else points
+
+
+def turned_axes(d: int) -> np.ndarray:
+    """Return the rotation R, (d, d), of the turned lattice R Z^d.
+
+    The product of the coordinates of any of its points but 0 is at least 1 / sqrt(5) (2D) or 1 / 7 (3D).
+    """
+    if d == 2:
+        angle = math.atan(2.0) / 2
+        return np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    a, b, c = (2 / math.sqrt(7) * math.sin(k * math.pi / 7) for k in (1, 2, 3))
+    return np.array([[-a, -b, -c], [-c, -a, b], [-b, c, -a]])
+
+
+def turned_points(half: np.ndarray, offset: float = 0.5) -> np.ndarray:
+    """Return the points of R (Z^d + offset) that are no farther than `half`, (d,), from 0 along each axis, (n, d)."""
+    axes = turned_axes(len(half))
+    reach = np.ceil(np.abs(axes.T) @ half).astype(int) + 1
+    # Lines along the last axis of the lattice: the numbers of the first and the last point of each in the box.
+    starts = np.meshgrid(*[np.arange(-r, r) + offset for r in reach[:-1]], indexing="ij")
+    lines = np.stack(starts, axis=-1).reshape(-1, len(half) - 1) @ axes[:, :-1].T
+    middle, span = -lines / axes[:, -1], half / np.abs(axes[:, -1])
+    first = np.ceil(np.max(middle - span, axis=1) - offset)
+    last = np.floor(np.min(middle + span, axis=1) - offset)
+    counts = np.maximum(0, last - first + 1).astype(int)
+    number = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+    along = np.repeat(first, counts) + number + offset
+    return np.repeat(lines, counts, axis=0) + along[:, None] * axes[:, -1]
+
+
+def turned_box(lower: np.ndarray, upper: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Return as many points of a turned lattice in a box, (n, d), m, as a lattice of `counts` points per axis has.
+
+    The lattice is stretched as that one is, and then a little more, such that the box holds just these.
+    """
+    half, n = counts / 2, math.prod(counts.tolist())
+    # About a point the lattice has odd numbers of points, about the middle of a cell even ones.
+    points = turned_points(half + 1, offset=0.0 if n % 2 else 0.5)
+    reach = np.max(np.abs(points) / half, axis=1)
+    chosen = np.argsort(reach, kind="stable")[: n + 1]
+    # The faces lie midway between the last point inside and the first one outside.
+    points = points[np.sort(chosen[:n])] / (counts * reach[chosen[n - 1 :]].mean())
+    return np.clip((lower + upper) / 2 + points * (upper - lower), lower, upper)

@@ -14,22 +14,11 @@ from pydantic import (
 )
 
 from mpmcli.scene.colliders import Collider
-from mpmcli.scene.contact import Contact
 from mpmcli.scene.domain import Domain
-from mpmcli.scene.entry import Constants, StartDeformation, StartMatrix, StartVector
-from mpmcli.scene.forces import Force, Impulse
+from mpmcli.scene.entry import ConstantTable, StartDeformation, StartMatrix, StartVector
+from mpmcli.scene.forces import Contact, Force, Impulse
 from mpmcli.scene.material import MaterialParameters
-from mpmcli.scene.quantity import (
-    NAME,
-    Flag,
-    Integer,
-    NotNegative,
-    Positive,
-    Table,
-    Vector,
-    flaw,
-    scene_dimension,
-)
+from mpmcli.scene.quantity import NAME, Flag, Integer, NotNegative, Positive, Table, Vector, flaw, scene_dimension
 from mpmcli.scene.shapes import OneShape
 
 
@@ -327,7 +316,7 @@ class Scene(Table):
     """
 
     title: str = Field("", description="One line that says what the scene is.")
-    constants: Constants | None = Field(
+    constants: ConstantTable | None = Field(
         None,
         description="Names for numbers, or for expressions of t, x, y, z, X, Y, Z and of the names above them, "
         "which every expression of the scene may use. Default: none.",
@@ -361,8 +350,13 @@ class Scene(Table):
         for pair in self.contact.pairs:
             if set(pair.between) == {first.name, second.name}:
                 return None if pair.friction == "stick" else pair.friction
-        separate = self.contact.default == "separate" and first.has_surface and second.has_surface
-        return self.contact.friction_of(first.material, second.material) if separate else None
+        if self.contact.default != "separate" or not (first.has_surface and second.has_surface):
+            return None
+        if self.contact.friction is not None:
+            return self.contact.friction
+        # That of the softer one, of equal ones the lower; a law of a plugin may have none.
+        materials = (first.material, second.material)
+        return min((own.shear_modulus, getattr(own, "surface_friction", 0.0)) for own in materials)[1]
 
     def separates(self, source: "Body | Emitter") -> bool:
         """Return whether a body has a velocity field of its own: its surface meets others, walls and colliders."""

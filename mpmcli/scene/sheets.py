@@ -87,26 +87,21 @@ class Sheets:
 
 
 def _even_cells(mouth: Mouth, shape: Shape, count: int) -> np.ndarray:
-    """Return points of an even sequence on the lattice of a mouth, (count, d - 1), in cells."""
+    """Return points of an even sequence on the lattice of a mouth, (count, d - 1), in cells.
+
+    Point k of the sequence is (k / r mod 1, k / r^2 mod 1), r the golden number in 2D and the plastic one in 3D. With k
+    as one more coordinate these are points of a lattice, which keep apart however it is stretched along that one
+    (docs/theory.md, 5.13).
+    """
     # Of the lattice a part is filled, and of the sequence about as much.
     many, d = 16 + int(1.1 * count * mouth.filled.size / max(1, mouth.filled.sum())), len(mouth.centre)
+    steps = _ROOTS[d] ** -np.arange(1.0, d)
     while True:
-        cells = even_sequence(d, many) * mouth.counts
+        cells = (0.5 + np.arange(many)[:, None] * steps) % 1.0 * mouth.counts
         cells = cells[shape.form.contains(mouth.place(cells))]
         if len(cells) >= count:
             return cells[:count]
         many *= 2
-
-
-def even_sequence(d: int, count: int) -> np.ndarray:
-    """Return the first points of a sequence that fills the unit interval (2D) or square (3D), (count, d - 1).
-
-    Point k is (k / r mod 1, k / r^2 mod 1), r the golden number in 2D and the plastic one in 3D. With k as one more
-    coordinate these are points of a lattice, which keep apart however it is stretched along that one (docs/theory.md,
-    5.13).
-    """
-    steps = _ROOTS[d] ** -np.arange(1.0, d)
-    return (0.5 + np.arange(count)[:, None] * steps) % 1.0
 
 
 def mouth_of(emitter: Emitter, h: float) -> Mouth:
@@ -187,8 +182,3 @@ def most_until_end(emitter: Emitter, scene: Scene, period: float, size: int) -> 
     """Return how many particles enter up to the end of an emitter, or of its scene, in sheets of a size."""
     end = min(scene.time.end, math.inf if emitter.end is None else emitter.end)
     return max(0, math.ceil((end - emitter.start) / period - _SLACK)) * size
-
-
-def emitted_volumes(scene: Scene) -> list[float]:
-    """Return the volume at rest of all particles of each emitter, m^3 (m^2 in 2D)."""
-    return [sheets.particles * sheets.volume for sheets in (sheets_of(emitter, scene) for emitter in scene.emitters)]

@@ -10,7 +10,7 @@ import numpy as np
 
 from mpmcli.scene.colliders import Collider, Plane
 from mpmcli.scene.mesh import Mesh
-from mpmcli.scene.primitives import Ball, Box, Capsule, Cylinder, Polygon
+from mpmcli.scene.primitives import Ball, Box, Capsule, Cylinder, Polygon, box_corners
 from mpmcli.scene.sampling import first_come
 
 if TYPE_CHECKING:
@@ -92,13 +92,9 @@ def within(surface: Surface, lower: np.ndarray, upper: np.ndarray, *, caps: bool
         return surface
     if (surface.points.min(axis=0) >= lower).all() and (surface.points.max(axis=0) <= upper).all():
         return surface
-    if surface.points.shape[1] == 2:
-        return _segments_within(surface, lower, upper)
-    return _triangles_within(surface, lower, upper, caps)
-
-
-def _segments_within(surface: Surface, lower: np.ndarray, upper: np.ndarray) -> Surface:
-    """Cut segments off at the box: each as a + s (b - a), from the last s at which it enters to the first it leaves."""
+    if surface.points.shape[1] == 3:
+        return _triangles_within(surface, lower, upper, caps)
+    # A segment is cut off as a + s (b - a), from the last s at which it enters to the first at which it leaves.
     a, b = surface.points[surface.cells[:, 0]], surface.points[surface.cells[:, 1]]
     along = b - a
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -240,9 +236,8 @@ def _arc(start: float, end: float) -> np.ndarray:
 
 
 def _box(lower: np.ndarray, upper: np.ndarray) -> Surface:
-    d = len(lower)
-    corners = np.array([[upper[a] if k >> a & 1 else lower[a] for a in range(d)] for k in range(2**d)])
-    if d == 2:
+    corners = box_corners(lower, upper)
+    if len(lower) == 2:
         return ring(corners[[0, 1, 3, 2]])
     return Surface(corners, np.array([t for a, b, c, e in BOX for t in ((a, b, c), (a, c, e))], dtype=np.int64))
 
@@ -296,7 +291,20 @@ def surface_points(surface: Surface, spacing: float) -> np.ndarray:
         return np.empty((0, surface.points.shape[1]))
     if surface.points.shape[1] == 2:
         return np.concatenate([_along(chain, spacing) for chain in surface.chains()])
-    return _apart(surface, spacing)
+    from scipy.spatial import cKDTree
+
+    # Of the candidates, those on sharp edges first and the others at random, each is taken that is apart from all
+    # before it.
+    random = np.random.default_rng(SEED)
+    shares = surface.sizes / surface.sizes.sum()
+    count = max(math.ceil(CANDIDATES * surface.sizes.sum() / spacing**2), 1)
+    cells = surface.cells[np.searchsorted(np.cumsum(shares), random.random(count) * (1 - 1e-12))]
+    u, v = random.random((2, count, 1))
+    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+    a, b, c = (surface.points[cells[:, k]] for k in range(3))
+    points = np.concatenate([_edge_points(surface, spacing), a + u * (b - a) + v * (c - a)])
+    pairs = cKDTree(points).query_pairs(APART * spacing, output_type="ndarray")
+    return points[first_come(pairs, len(points))]
 
 
 def _along(chain: np.ndarray, spacing: float) -> np.ndarray:
@@ -309,7 +317,14 @@ def _along(chain: np.ndarray, spacing: float) -> np.ndarray:
         chain = np.roll(chain[:-1], -int(turns[0]) if len(turns) else 0, axis=0)
         chain = np.concatenate([chain, chain[:1]])
     cuts = [0, *(1 + np.flatnonzero(_turns(chain))).tolist(), len(chain) - 1]
-    found = [_even(chain[a : b + 1], spacing) for a, b in pairwise(cuts)]
+    found = []
+    for a, b in pairwise(cuts):
+        # At equal distances, the first one and not the last.
+        part = chain[a : b + 1]
+        gone = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(part, axis=0), axis=1))])
+        count = max(round(gone[-1] / spacing), 1)
+        places = gone[-1] * np.arange(count) / count
+        found.append(np.stack([np.interp(places, gone, axis) for axis in part.T], axis=1))
     return np.concatenate(found if closed else [*found, chain[-1:]])
 
 
@@ -318,33 +333,6 @@ def _turns(chain: np.ndarray) -> np.ndarray:
     along = np.diff(chain, axis=0)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     return np.sum(along[1:] * along[:-1], axis=1) < SHARP
-
-
-def _even(chain: np.ndarray, spacing: float) -> np.ndarray:
-    """Return points at equal distances on a line (k, d), the first one and not the last."""
-    gone = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(chain, axis=0), axis=1))])
-    count = max(round(gone[-1] / spacing), 1)
-    places = gone[-1] * np.arange(count) / count
-    return np.stack([np.interp(places, gone, axis) for axis in chain.T], axis=1)
-
-
-def _apart(surface: Surface, spacing: float) -> np.ndarray:
-    """Return random points on triangles that are apart from each other: on the sharp edges first.
-
-    Of the candidates, in random order, each is taken that has none before it within the least distance.
-    """
-    from scipy.spatial import cKDTree
-
-    random = np.random.default_rng(SEED)
-    shares = surface.sizes / surface.sizes.sum()
-    count = max(math.ceil(CANDIDATES * surface.sizes.sum() / spacing**2), 1)
-    cells = surface.cells[np.searchsorted(np.cumsum(shares), random.random(count) * (1 - 1e-12))]
-    u, v = random.random((2, count, 1))
-    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
-    a, b, c = (surface.points[cells[:, k]] for k in range(3))
-    points = np.concatenate([_edge_points(surface, spacing), a + u * (b - a) + v * (c - a)])
-    pairs = cKDTree(points).query_pairs(APART * spacing, output_type="ndarray")
-    return points[first_come(pairs, len(points))]
 
 
 def _edge_points(surface: Surface, spacing: float) -> np.ndarray:

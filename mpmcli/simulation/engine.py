@@ -1,16 +1,70 @@
-"""Chooses what computes a scene by the number of steps that the check forecasts."""
+"""Chooses what computes a scene by the forecast of the check, and compiles kernels ahead."""
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 
 from mpmcli.check.facts import SceneFacts
 from mpmcli.check.forecast import expected_steps
-from mpmcli.scene import Scene
-from mpmcli.solver.engine import build
-from mpmcli.solver.machine.backend import Arch, Backend
+from mpmcli.materials.registry import parameter_models
+from mpmcli.processes.pool import Fault, in_processes
+from mpmcli.scene import Scene, load_scene
+from mpmcli.solver.engine import run as engine_run
+from mpmcli.solver.machine.backend import Arch, Backend, start, stop_backend
 
 
 def backend_for(
     scene: Scene, arch: Arch = "auto", threads: int | None = None, *, compile_cache: bool = True
 ) -> Backend:
     """Return the backend for a scene, not started; InputError: it cannot be used, or no step is stable."""
-    return build.backend_for(
+    return engine_run.backend_for(
         scene, lambda: expected_steps(SceneFacts(scene)), arch, threads, compile_cache=compile_cache
     )
+
+
+# Time limit of a process, s.
+TIMEOUT = 1800.0
+# No step of a scene is as small, s: it compiles, and computes nothing worth keeping.
+NO_STEP = 1e-12
+
+
+@dataclass(frozen=True)
+class Warmed:
+    """The outcome of a process.
+
+    Attributes:
+        stored: whether a stored kernel was found; seconds: of wall time.
+        fault: why there is no outcome, "" if there is one.
+    """
+
+    scene: Path
+    stored: bool = False
+    seconds: float = 0.0
+    fault: str = ""
+
+
+def warm(
+    scenes: Sequence[Path],
+    at_once: int,
+    arch: str = "auto",
+    threads: int | None = None,
+    stop: Callable[[], bool] = lambda: False,
+) -> Iterator[Warmed]:
+    """Take a step of each scene in a process of its own, and yield outcomes as they end."""
+    compile_one = partial(_compile, arch=arch, threads=threads)
+    for scene, outcome in in_processes(scenes, at_once, compile_one, TIMEOUT, stop):
+        yield Warmed(scene, fault=outcome.words) if isinstance(outcome, Fault) else outcome
+
+
+def _compile(path: Path, arch: str, threads: int | None) -> Warmed:
+    began = time.perf_counter()
+    scene = load_scene(path, laws=parameter_models()).scene
+    backend = backend_for(scene, arch, threads)
+    start(backend)
+    run = engine_run.build_run(scene, backend)
+    run.step(NO_STEP)
+    stored = backend.on_cpu and run.batch.launch_cpu.stored
+    stop_backend()
+    return Warmed(path, stored, time.perf_counter() - began)

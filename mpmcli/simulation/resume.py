@@ -17,9 +17,8 @@ from mpmcli.output.checkpoints import Checkpoint, read_checkpoints
 from mpmcli.output.checksums import path_digest
 from mpmcli.output.directory import SCENE, has_frames
 from mpmcli.output.durable import TEMPORARY_SUFFIX, number_of, sync_directory
-from mpmcli.output.layout import FrameIndex
+from mpmcli.output.layout import DAMAGED, PACKED, SEGMENTS, FrameIndex, sealed_segments, segment_name
 from mpmcli.output.lock import LOCK
-from mpmcli.output.segments import DAMAGED, PACKED, SEGMENTS, sealed_segments, segment_name
 from mpmcli.output.series import remove_series
 from mpmcli.output.verify import verify_file
 from mpmcli.output.vtkhdf import read_index_of

@@ -1,20 +1,78 @@
 """Computes many scenes, one after another, in one process: scenes of one kind share the device and its kernels."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
+from mpmcli.check.finding import Verdict
+from mpmcli.check.result_check import check_kept
 from mpmcli.errors import MpmcliError
-from mpmcli.scene import BodyParticles, Scene, sample_bodies
-from mpmcli.simulation.recording import Recorder, Recording, record
+from mpmcli.frames.frame import Frame
+from mpmcli.frames.ledger import LedgerRow
+from mpmcli.materials.registry import laws
+from mpmcli.output.header import RunHeader
+from mpmcli.scene import BodyParticles, Scene, sample_bodies, scene_to_toml
 from mpmcli.solver.engine.batch import Batch
-from mpmcli.solver.engine.build import build_run, suits_batch
 from mpmcli.solver.engine.compiled_kind import CompiledKind
-from mpmcli.solver.engine.run import Run
-from mpmcli.solver.frames.diagnosis import UnstableRunError
+from mpmcli.solver.engine.run import Run, build_run, frames_of_all, suits_batch
+from mpmcli.solver.frames.diagnosis import LEFT, OUTRAN, UnstableRunError
 from mpmcli.solver.grid.sparse_grid import wants_sparse
 from mpmcli.solver.machine.backend import Arch, Backend, Optimisation, choose_backend, start, stop_backend
-from mpmcli.solver.machine.plan import make_plan, require_room
-from mpmcli.solver.machine.room import power_of_two
+from mpmcli.solver.machine.plan import make_plan, power_of_two, require_memory
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A run with T frames and rows, fewer where it stopped, its verdict, and why that is not "stable"."""
+
+    header: RunHeader
+    frames: Sequence[Frame]
+    ledger: Sequence[LedgerRow]
+    steps: int
+    particles: int
+    verdict: Verdict
+    reason: str
+
+
+class Recorder:
+    """Keeps the frames of a run while it goes on."""
+
+    def __init__(self, run: Run, scene: Scene, backend: Backend) -> None:
+        facts = {"arch": backend.arch, "threads": backend.threads, "precision": backend.precision}
+        self._header = RunHeader.of(scene, scene_to_toml(scene), [laws()[name] for name in run.laws], facts)
+        self._run = run
+        self._frames: list[Frame] = []
+        self._ledger: list[LedgerRow] = []
+
+    def take(self, frame: Frame, row: LedgerRow) -> None:
+        """Keep a frame."""
+        self._frames.append(frame)
+        self._ledger.append(row)
+
+    def finished(self) -> Recording:
+        """Return the recording of a run that has reached its end."""
+        check = check_kept(self._header, self._frames, self._ledger)
+        return self._recording(check.verdict, next((f.what for f in check.findings if f.severity != "note"), ""))
+
+    def stopped(self, error: UnstableRunError) -> Recording:
+        """Return the recording of a run that became unstable."""
+        escaped = error.diagnosis.cause.startswith((LEFT, OUTRAN))
+        return self._recording("escaped" if escaped else "unstable", str(error))
+
+    def _recording(self, verdict: Verdict, reason: str) -> Recording:
+        counts = self._run.step_count, self._run.particle_count
+        return Recording(self._header, self._frames, self._ledger, *counts, verdict, reason)
+
+
+def record(run: Run, scene: Scene, backend: Backend, stop: Callable[[], bool] = lambda: False) -> Recording:
+    """Run a scene to its end or to where it stops; KeyboardInterrupt where `stop` returned True."""
+    recorder = Recorder(run, scene, backend)
+    try:
+        for frame, row in run.frames(stop):
+            recorder.take(frame, row)
+    except UnstableRunError as error:
+        return recorder.stopped(error)
+    return recorder.finished()
+
 
 # Kinds whose kernels are kept at once, and particles below which a scene is computed by kernels that are kept.
 MOST_KINDS, FEW_PARTICLES = 8, 20_000
@@ -68,7 +126,7 @@ class Runner:
             backend = replace(backend, threads=1) if backend.on_cpu else backend
             run = Run(self._batch_for(CompiledKind.of(scene, particles), backend), 0, scene, particles)
         else:
-            require_room(make_plan(scene, backend))
+            require_memory(make_plan(scene, backend))
             self._restart(backend)
             run = build_run(scene, backend, particles)
         return record(run, scene, backend, stop)
@@ -110,34 +168,21 @@ class Runner:
     ) -> Iterator[tuple[int, Recording | Exception]]:
         backend = self._choose(next(iter(scenes.values()))[0])
         batch = self._batch_for(kind, backend, len(scenes))
-        runs: dict[int, tuple[Recorder, Iterator]] = {}
+        runs: dict[int, Run] = {}
+        recorders: dict[int, Recorder] = {}
         for slot, (place, (scene, particles)) in enumerate(scenes.items()):
             try:
-                run = Run(batch, slot, scene, particles)
-                runs[place] = Recorder(run, scene, backend), run.events()
+                runs[place] = Run(batch, slot, scene, particles)
+                recorders[place] = Recorder(runs[place], scene, backend)
             except Exception as error:
                 yield place, error
-        while runs:
-            for place, (recorder, events) in list(runs.items()):
-                outcome: Recording | Exception | None = None
-                try:
-                    while (event := next(events)) is not None:
-                        recorder.take(*event)
-                except StopIteration:
-                    outcome = recorder.finished()
-                except UnstableRunError as error:
-                    outcome = recorder.stopped(error)
-                except Exception as error:
-                    outcome = error
-                if outcome is not None:
-                    del runs[place]
-                    yield place, outcome
-            if runs:
-                try:
-                    batch.launch()
-                except Exception as error:
-                    yield from ((place, error) for place in runs)
-                    return
+        for place, event in frames_of_all(runs):
+            if isinstance(event, tuple):
+                recorders[place].take(*event)
+            elif event is None:
+                yield place, recorders.pop(place).finished()
+            else:
+                yield place, recorders[place].stopped(event) if isinstance(event, UnstableRunError) else event
 
     def _choose(self, scene: Scene) -> Backend:
         return choose_backend(self._arch, self._threads, scene.solver.precision, optimisation=self._optimisation)
@@ -159,7 +204,7 @@ class Runner:
             wanted = joined or wanted
         if wanted is not kind or len(self._batches) == MOST_KINDS:
             self._restart(backend)
-        self._batches.append(Batch(wanted.roomy(), backend, power_of_two(runs)))
+        self._batches.append(Batch(wanted.padded(), backend, power_of_two(runs)))
         return self._batches[-1]
 
 

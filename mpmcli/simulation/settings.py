@@ -1,12 +1,134 @@
-"""Settings of a run that are not part of its scene."""
+"""Settings of a run that are not part of its scene, and why it ends before its end."""
 
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from mpmcli.simulation.limits import Limits
+import psutil
+
+from mpmcli.errors import InputError
+from mpmcli.plain_text import size_text
 from mpmcli.solver.machine.backend import Arch
+from mpmcli.solver.machine.plan import Plan
+
+# Time kept for the last records and the end of the process, s, and multiple of the longest pause between two questions
+# that is kept for the next one.
+RESERVE, PAUSES = 2.0, 1.5
+# Packing reads, writes and compares what was written once; bytes/s of compression.
+PACKING, COMPRESSION = 3.0, 30e6
+# Wall time that packing may take after a signal, s.
+PACKING_LEFT = 1.5
+# Time between two looks at the memory, s.
+MEMORY_LOOKS = 0.1
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Limits of one run, None for no limit: wall time of the process, s, and its resident memory, bytes."""
+
+    max_time: float | None = None
+    max_memory: int | None = None
+
+    def require_memory(self, plan: Plan) -> None:
+        """Raise InputError where a plan and what the process takes now need more memory than the limit."""
+        if self.max_memory is None:
+            return
+        need = resident_bytes() + plan.machine_bytes
+        if need > self.max_memory:
+            raise InputError(
+                f"the run needs {size_text(need)} of memory, and --max-memory is {size_text(self.max_memory)}: raise "
+                "it, or take a larger domain.spacing or fewer particles_per_cell."
+            )
+
+
+class StopCondition:
+    """Answers whether to end a run: "interrupted" by `signal`, or "stopped" at a limit, and why in `message`."""
+
+    def __init__(self, stop: Callable[[], bool | str], limits: Limits, *, compress: bool = False) -> None:
+        """Begin; `stop` tells whether to interrupt the run, or the signal that asks for it."""
+        self._stop, self._limits, self._compress = stop, limits, compress
+        self._end = None if limits.max_time is None else limits.max_time + _process_began()
+        self._asked: float | None = None
+        self._pause = 0.0
+        self._looked = 0.0
+        self._written, self._seconds = 0, 0.0
+        self.status: Literal["", "interrupted", "stopped"] = ""
+        self.message = self.signal = ""
+
+    def wrote(self, size: int, seconds: float) -> None:
+        """Take note of what has been sealed so far, bytes, and the wall time that it took, s."""
+        self._written, self._seconds = size, seconds
+
+    def __call__(self) -> bool:
+        if self.status:
+            return True
+        now = time.monotonic()
+        if self._asked is not None:
+            self._pause = max(self._pause, now - self._asked)
+        self._asked = now
+        if self._ask_signal():
+            return True
+        packing = PACKING * self._seconds + (self._written / COMPRESSION if self._compress else 0.0)
+        if self._end is not None and now + PAUSES * self._pause + packing > self._end - RESERVE:
+            return self._stop_for(f"the run stopped before its --max-time of {_clock(self._limits.max_time)}")
+        return self._limits.max_memory is not None and self._exceeds_memory(now)
+
+    def packing(self) -> bool:
+        """Return whether to end the packing of a result; its frames then stay as they are."""
+        if self.status != "interrupted" and self._ask_signal():
+            return True
+        if self.status == "interrupted":
+            return time.monotonic() > self._asked + PACKING_LEFT
+        return self._end is not None and time.monotonic() > self._end - RESERVE
+
+    def interrupted(self) -> None:
+        """Take note of a KeyboardInterrupt that came by itself, if there is no other reason."""
+        if not self._ask_signal() and not self.status:
+            self.status, self.message = "interrupted", "the run was interrupted"
+            self._asked = time.monotonic()
+
+    def _ask_signal(self) -> bool:
+        if said := self._stop():
+            self.signal = said if isinstance(said, str) else ""
+            how = f" ({self.signal})" if self.signal else ""
+            self.status, self.message = "interrupted", f"the run was interrupted{how}"
+            self._asked = time.monotonic()
+        return bool(said)
+
+    def _exceeds_memory(self, now: float) -> bool:
+        if now - self._looked < MEMORY_LOOKS:
+            return False
+        self._looked = now
+        size = resident_bytes()
+        if size <= self._limits.max_memory:
+            return False
+        return self._stop_for(
+            f"the run takes {size_text(size)} of memory and stopped at its --max-memory of "
+            f"{size_text(self._limits.max_memory)}"
+        )
+
+    def _stop_for(self, message: str) -> bool:
+        self.status, self.message = "stopped", message
+        return True
+
+
+def resident_bytes() -> int:
+    """Return the memory that this process has in use, bytes."""
+    return psutil.Process().memory_info().rss
+
+
+def _process_began() -> float:
+    """Return when this process began, in the time of `time.monotonic`, s."""
+    age = time.time() - psutil.Process().create_time()
+    # The clock may have been set since.
+    return time.monotonic() - min(max(age, 0.0), 60.0)
+
+
+def _clock(seconds: float) -> str:
+    whole = round(seconds)
+    return f"{whole // 3600}:{whole // 60 % 60:02}:{whole % 60:02}" if whole >= 60 else f"{seconds:g} s"
 
 
 @dataclass(frozen=True)

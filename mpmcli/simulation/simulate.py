@@ -3,34 +3,36 @@
 import time
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from typing import NamedTuple
 
 from mpmcli.check.finding import Finding, passes
-from mpmcli.check.scene_check import SceneCheck, check_scene
-from mpmcli.errors import InputError, MpmcliError, NoRoomError, RunError
+from mpmcli.check.scene_check import check_scene
+from mpmcli.errors import DiskFullError, InputError, MpmcliError, RunError
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.materials.registry import laws
 from mpmcli.output import RunRecord, check_directory, open_result
-from mpmcli.output.directory import SCENE, TakenDirectory, take_directory
+from mpmcli.output.directory import SCENE, take_directory
 from mpmcli.output.header import RunHeader
-from mpmcli.output.segments import sealed_segments
+from mpmcli.output.layout import sealed_segments
 from mpmcli.output.series import SERIES
 from mpmcli.output.store import SegmentStore
 from mpmcli.scene import LoadedScene, Scene, scene_to_toml
-from mpmcli.simulation.checkpointing import Checkpointer
 from mpmcli.simulation.engine import backend_for
-from mpmcli.simulation.limits import Halt
-from mpmcli.simulation.resume import Resumption, find_resumption, go_on, require_same_run, take_over
-from mpmcli.simulation.settings import RunSettings
-from mpmcli.simulation.stopwatch import Stopwatch
-from mpmcli.simulation.stored_run import finish, new_record, new_store, new_summary, write_scene
-from mpmcli.simulation.summary import RunSummary
-from mpmcli.solver.engine.build import build_run
-from mpmcli.solver.engine.run import Run
+from mpmcli.simulation.resume import find_resumption, go_on, require_same_run, take_over
+from mpmcli.simulation.settings import RunSettings, StopCondition
+from mpmcli.simulation.stored_run import (
+    Checkpointer,
+    RunContext,
+    finish,
+    new_record,
+    new_store,
+    new_summary,
+    write_scene,
+)
+from mpmcli.simulation.summary import RunSummary, Stopwatch
+from mpmcli.solver.engine.run import Run, build_run
 from mpmcli.solver.frames.diagnosis import UnstableRunError
-from mpmcli.solver.machine.backend import Backend, start
-from mpmcli.solver.machine.device_memory import is_out_of_memory, out_of_memory_sentence
-from mpmcli.solver.machine.plan import Plan, make_plan, require_room
+from mpmcli.solver.machine.backend import Backend, is_out_of_memory, out_of_memory_sentence, start
+from mpmcli.solver.machine.plan import Plan, make_plan, require_memory
 
 
 def simulate(
@@ -83,28 +85,16 @@ def simulate(
             if earlier is None:
                 taken.clear()
         notes = (*loaded.notes, *(finding.line for finding in findings if finding.severity != "note"))
-        begun = _Begun(loaded, settings, plan, backend, earlier, notes, began, taken, check)
+        context = RunContext(loaded, settings, plan, backend, earlier, notes, began, taken, check)
         if run is None:
-            return _complete(begun, on_start, stop)
-        return _store_run(begun, run, on_start, on_frame, stop)
-
-
-class _Begun(NamedTuple):
-    loaded: LoadedScene
-    settings: RunSettings
-    plan: Plan
-    backend: Backend
-    earlier: Resumption | None
-    notes: tuple[str, ...]
-    began: float
-    taken: TakenDirectory
-    check: SceneCheck
+            return _complete(context, on_start, stop)
+        return _store_run(context, run, on_start, on_frame, stop)
 
 
 def _build(scene: Scene, settings: RunSettings, plan: Plan, backend: Backend) -> Run:
     """Put a scene on the device; InputError: there is too little memory, or a particle is not in the domain."""
-    require_room(plan)
-    settings.limits.require_room(plan)
+    require_memory(plan)
+    settings.limits.require_memory(plan)
     start(backend)
     try:
         return build_run(scene, backend, force=settings.force)
@@ -115,35 +105,32 @@ def _build(scene: Scene, settings: RunSettings, plan: Plan, backend: Backend) ->
 
 
 def _store_run(
-    begun: _Begun,
+    context: RunContext,
     run: Run,
     on_start: Callable[[RunSummary], None],
     on_frame: Callable[[LedgerRow, RunSummary], None],
     stop: Callable[[], bool | str],
 ) -> RunSummary:
-    loaded, settings, plan, backend, earlier, notes, began, taken, check = begun
-    scene = loaded.scene
-    forced = settings.force and scene.time.step != "auto"
+    scene, settings, plan, earlier = context.scene, context.settings, context.plan, context.earlier
     text = scene_to_toml(scene)
-    facts = {"arch": backend.arch, "threads": backend.threads, "precision": backend.precision}
-    header = RunHeader.of(scene, text, [laws()[name] for name in run.laws], facts)
+    header = RunHeader.of(scene, text, [laws()[name] for name in run.laws], context.facts)
     if earlier is not None:
-        require_same_run(earlier, header.stored, settings.directory)
-        go_on(run, earlier, backend, forced=forced)
-        take_over(settings.directory, earlier)
-    summary = new_summary(loaded, settings, plan, backend, earlier, notes)
+        require_same_run(earlier, header.stored, context.directory)
+        go_on(run, earlier, context.backend, forced=context.forced)
+        take_over(context.directory, earlier)
+    summary = new_summary(context)
     summary.particles = run.particle_count
     if earlier is None:
-        summary.outlook, summary.compiling = check.outlook(), check.forecast.compile_seconds
+        summary.outlook, summary.compiling = context.check.outlook(), context.check.forecast.compile_seconds
     on_start(summary)
-    record = new_record(loaded, settings, summary, earlier)
+    record = new_record(context, summary)
     record.write()
-    write_scene(settings.directory, text)
-    store = new_store(loaded, settings, header.stored, earlier)
+    write_scene(context.directory, text)
+    store = new_store(context, header.stored)
     options = {"size": plan.particles * plan.bytes_per_particle, "every": settings.checkpoint_every}
-    checkpoints = Checkpointer(settings.directory, run, store, summary.backend, forced=forced, **options)
-    clock = Stopwatch(summary.timings, began)
-    halt = Halt(stop, settings.limits, compress=scene.output.compress)
+    checkpoints = Checkpointer(context.directory, run, store, summary.backend, forced=context.forced, **options)
+    clock = Stopwatch(summary.timings, context.began)
+    halt = StopCondition(stop, settings.limits, compress=scene.output.compress)
     failure: dict = {}
     try:
         _compute(run, store, checkpoints, record, summary, clock, on_frame, halt)
@@ -155,14 +142,14 @@ def _store_run(
     except UnstableRunError as error:
         summary.status, summary.message = "unstable", str(error)
         failure = vars(error.diagnosis)
-    except NoRoomError as error:
+    except DiskFullError as error:
         summary.status, summary.message = "stopped", str(error)
     except MpmcliError as error:
         summary.status, summary.message = "failed", str(error)
     except (RuntimeError, MemoryError) as error:
         if not is_out_of_memory(error):
             raise
-        summary.status, summary.message = "failed", out_of_memory_sentence(backend.arch, error)
+        summary.status, summary.message = "failed", out_of_memory_sentence(context.backend.arch, error)
     finally:
         if summary.status == "running":
             # A fault of mpmcli: the record must not state that the run is going on.
@@ -170,38 +157,41 @@ def _store_run(
     summary.steps = run.step_count
     clock.book(run.first_step_seconds, "compile_s")
     with clock.adding("output_s"):
-        finish(store, summary, halt, loaded, settings)
+        finish(context, store, summary, halt)
     clock.stop()
     if summary.status == "interrupted" and not summary.frames:
-        taken.undo()
+        context.taken.undo()
         return summary
     record.timings = summary.timings
     record.close(summary.status, summary.message, **failure)
     return summary
 
 
-def _complete(begun: _Begun, on_start: Callable[[RunSummary], None], stop: Callable[[], bool | str]) -> RunSummary:
+def _complete(
+    context: RunContext, on_start: Callable[[RunSummary], None], stop: Callable[[], bool | str]
+) -> RunSummary:
     """Pack the frames of a run that had stored all of them; nothing is done where they are packed."""
-    loaded, settings, plan, backend, earlier, notes, began, *_ = begun
-    summary = new_summary(loaded, settings, plan, backend, earlier, notes)
+    settings, earlier, directory = context.settings, context.earlier, context.directory
+    summary = new_summary(context)
     on_start(summary)
-    clock = Stopwatch(summary.timings, began)
-    text = scene_to_toml(loaded.scene)
-    packed = not sealed_segments(settings.directory)
-    series = settings.directory / SERIES
-    same = (settings.directory / SCENE).read_text(encoding="utf-8") == text
+    clock = Stopwatch(summary.timings, context.began)
+    text = scene_to_toml(context.scene)
+    packed = not sealed_segments(directory)
+    series = directory / SERIES
+    same = (directory / SCENE).read_text(encoding="utf-8") == text
     done = packed and same and earlier.record["status"] == "finished"
     if done and (settings.form == "vtkhdf" or series.exists()):
         summary.status = "finished"
-        summary.path = series if settings.form == "vtk" else open_result(settings.directory).path
+        summary.path = series if settings.form == "vtk" else open_result(directory).path
         return summary
-    record = new_record(loaded, settings, summary, earlier)
-    take_over(settings.directory, earlier)
-    write_scene(settings.directory, text)
-    store = new_store(loaded, settings, {**earlier.index.header, "scene": text}, earlier)
+    record = new_record(context, summary)
+    take_over(directory, earlier)
+    write_scene(directory, text)
+    store = new_store(context, {**earlier.index.header, "scene": text})
     summary.status = "finished"
+    halt = StopCondition(stop, settings.limits, compress=context.scene.output.compress)
     with clock.adding("output_s"):
-        finish(store, summary, Halt(stop, settings.limits, compress=loaded.scene.output.compress), loaded, settings)
+        finish(context, store, summary, halt)
     clock.stop()
     record.timings = summary.timings
     record.close(summary.status, summary.message)
@@ -216,7 +206,7 @@ def _compute(
     summary: RunSummary,
     clock: Stopwatch,
     on_frame: Callable[[LedgerRow, RunSummary], None],
-    halt: Halt,
+    halt: StopCondition,
 ) -> None:
     """Compute and store frame after frame; the record and the summary follow the frames that are sealed."""
     rows: list[LedgerRow] = []

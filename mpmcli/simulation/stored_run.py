@@ -1,35 +1,75 @@
-"""Opens and closes the record, the summary, the scene and the store of a run."""
+"""What a run stores: the record, the scene, the frames, checkpoints."""
 
+import time
+from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from mpmcli.errors import NoRoomError, RunError
-from mpmcli.output import RunRecord, SegmentStore
-from mpmcli.output.directory import SCENE
+from mpmcli.check.scene_check import SceneCheck
+from mpmcli.errors import DiskFullError, RunError
+from mpmcli.output import RunRecord
+from mpmcli.output.checkpoints import Checkpoint, write_checkpoint
+from mpmcli.output.directory import SCENE, TakenDirectory
 from mpmcli.output.durable import write_text
-from mpmcli.output.segments import DAMAGED
+from mpmcli.output.layout import DAMAGED
 from mpmcli.output.series import write_series
-from mpmcli.output.store import HOLD
-from mpmcli.scene import LoadedScene
-from mpmcli.simulation.limits import Halt
+from mpmcli.output.store import HOLD, SegmentStore
+from mpmcli.scene import LoadedScene, Scene
 from mpmcli.simulation.resume import Resumption, file_digests
-from mpmcli.simulation.settings import RunSettings
+from mpmcli.simulation.settings import RunSettings, StopCondition
 from mpmcli.simulation.summary import RunSummary
+from mpmcli.solver.engine.run import Run
 from mpmcli.solver.machine.backend import Backend
 from mpmcli.solver.machine.plan import Plan
 
 
-def new_summary(
-    loaded: LoadedScene,
-    settings: RunSettings,
-    plan: Plan,
-    backend: Backend,
-    earlier: Resumption | None,
-    notes: tuple[str, ...],
-) -> RunSummary:
+class RunContext(NamedTuple):
+    """What a run is begun with.
+
+    Attributes:
+        began: when, as of `time.perf_counter`, s; earlier: the part that it goes on from.
+        notes: what was chosen for the user, and warnings of the check.
+        taken: the directory, which no other process writes.
+    """
+
+    loaded: LoadedScene
+    settings: RunSettings
+    plan: Plan
+    backend: Backend
+    earlier: Resumption | None
+    notes: tuple[str, ...]
+    began: float
+    taken: TakenDirectory
+    check: SceneCheck
+
+    @property
+    def scene(self) -> Scene:
+        """The scene."""
+        return self.loaded.scene
+
+    @property
+    def directory(self) -> Path:
+        """Where the result goes."""
+        return self.settings.directory
+
+    @property
+    def forced(self) -> bool:
+        """Whether time.step is taken above the stable step, too."""
+        return self.settings.force and self.scene.time.step != "auto"
+
+    @property
+    def facts(self) -> dict[str, object]:
+        """The backend, as a header states it."""
+        backend = self.backend
+        return {"arch": backend.arch, "threads": backend.threads, "precision": backend.precision}
+
+
+def new_summary(context: RunContext) -> RunSummary:
     """Return the summary of a run that begins, or goes on from an earlier part."""
-    facts = {"arch": backend.arch, "threads": backend.threads, "precision": backend.precision}
-    summary = RunSummary(settings.directory, plan.particles, loaded.scene.time.frames + 1, facts, notes, plan)
+    plan, earlier = context.plan, context.earlier
+    expected = context.scene.time.frames + 1
+    summary = RunSummary(context.directory, plan.particles, expected, context.facts, context.notes, plan)
     if earlier is not None:
         summary.notes += (earlier.note,)
         summary.frames = earlier.frames
@@ -40,18 +80,11 @@ def new_summary(
     return summary
 
 
-def new_store(
-    loaded: LoadedScene, settings: RunSettings, header: dict[str, Any], earlier: Resumption | None
-) -> SegmentStore:
+def new_store(context: RunContext, header: dict[str, Any]) -> SegmentStore:
     """Return the store of a run, which goes on after the frames that are there."""
-    scene = loaded.scene
-    store = SegmentStore(
-        settings.directory,
-        header,
-        compress=scene.output.compress,
-        hold=HOLD,
-        colliders=scene.colliders,
-    )
+    scene, earlier = context.scene, context.earlier
+    compress, colliders = scene.output.compress, scene.colliders
+    store = SegmentStore(context.directory, header, compress=compress, hold=HOLD, colliders=colliders)
     if earlier is not None and earlier.index is not None:
         store.go_on_after(earlier.index)
     return store
@@ -65,7 +98,7 @@ def write_scene(directory: Path, text: str) -> None:
         raise RunError(f"{directory / SCENE} could not be written ({error.strerror or error}).") from error
 
 
-def finish(store: SegmentStore, summary: RunSummary, halt: Halt, loaded: LoadedScene, settings: RunSettings) -> None:
+def finish(context: RunContext, store: SegmentStore, summary: RunSummary, halt: StopCondition) -> None:
     """Pack what was stored, and write it as a series too, if that is asked for.
 
     Until then, the result is the directory with its sealed frames.
@@ -73,11 +106,10 @@ def finish(store: SegmentStore, summary: RunSummary, halt: Halt, loaded: LoadedS
     summary.path = summary.directory
     try:
         summary.path = store.finish(halt.packing)
-        (settings.directory / DAMAGED).unlink(missing_ok=True)
-        if settings.form == "vtk" and summary.path is not None:
-            scene = loaded.scene
-            compress = scene.output.compress
-            summary.path = write_series(settings.directory, scene.colliders, compress=compress, stop=halt.packing)
+        (context.directory / DAMAGED).unlink(missing_ok=True)
+        if context.settings.form == "vtk" and summary.path is not None:
+            colliders, compress = context.scene.colliders, context.scene.output.compress
+            summary.path = write_series(context.directory, colliders, compress=compress, stop=halt.packing)
     except KeyboardInterrupt:
         if not halt.status:
             halt.interrupted()
@@ -87,23 +119,20 @@ def finish(store: SegmentStore, summary: RunSummary, halt: Halt, loaded: LoadedS
         summary.status, summary.message = halt.status, f"{halt.message}; {where}"
     except RunError as error:
         if summary.status == "finished":
-            summary.status = "stopped" if isinstance(error, NoRoomError) else "failed"
+            summary.status = "stopped" if isinstance(error, DiskFullError) else "failed"
         summary.message = f"{summary.message} {error}".strip()
 
 
-def new_record(
-    loaded: LoadedScene, settings: RunSettings, summary: RunSummary, earlier: Resumption | None
-) -> RunRecord:
+def new_record(context: RunContext, summary: RunSummary) -> RunRecord:
     """Return the record of a run, which goes on from that of an earlier part."""
+    earlier = context.earlier
     record = RunRecord(
-        settings.directory,
-        command=settings.command,
+        context.directory,
+        command=context.settings.command,
         backend=summary.backend,
-        seeds={
-            source.name: source.seed for source in loaded.scene.sources if source.sampling in ("jittered", "poisson")
-        },
-        forced=settings.force and loaded.scene.time.step != "auto",
-        files=file_digests(loaded),
+        seeds={one.name: one.seed for one in context.scene.sources if one.sampling in ("jittered", "poisson")},
+        forced=context.forced,
+        files=file_digests(context.loaded),
         frames_expected=summary.frames_expected,
         particles=summary.particles,
         notes=summary.notes,
@@ -111,3 +140,60 @@ def new_record(
     if earlier is not None:
         record.go_on_from(earlier.record, earlier.rows, earlier.step)
     return record
+
+
+# Share of the wall time that checkpoints may take, and the least time between two, s.
+SHARE, LEAST = 0.008, 5.0
+# Before the first one: seconds to compile what reads the device, and bytes written in a second.
+FIRST, RATE = 1.0, 3e8
+
+
+class Checkpointer:
+    """Takes checkpoints of one run; `seconds` of wall time spent so far, and number `taken`."""
+
+    def __init__(
+        self,
+        directory: Path,
+        run: Run,
+        store: SegmentStore,
+        backend: Mapping[str, object],
+        *,
+        size: int,
+        forced: bool,
+        every: float | None = None,
+    ) -> None:
+        """Begin; `size` is of the particles, bytes, `every` s between two, None: at a cost of SHARE of the time."""
+        self._directory, self._run, self._store = directory, run, store
+        self._backend = {name: str(backend[name]) for name in ("arch", "precision")}
+        self._forced, self._every = forced, every
+        self._cost = FIRST + size / RATE
+        self._last = time.monotonic()
+        self.seconds, self.taken = 0.0, 0
+
+    def due(self) -> bool:
+        """Return whether the next one is."""
+        wait = max(LEAST, self._cost / SHARE) if self._every is None else self._every
+        return time.monotonic() - self._last >= wait
+
+    def take(self) -> None:
+        """Seal waiting frames, else RunError, and then the state; where the disk is full, go on without."""
+        began = time.monotonic()
+        self._store.seal()
+        sealed = time.monotonic()
+        with suppress(OSError, RunError):
+            saved = self._run.save()
+            numbers = saved.numbers
+            point = Checkpoint(
+                frame=int(numbers["frames"][0]),
+                step=self._run.step_count,
+                time=self._run.time,
+                backend=self._backend,
+                forced=self._forced,
+                numbers=numbers,
+                arrays=saved.arrays,
+            )
+            write_checkpoint(self._directory, point, saved.arrays.nbytes)
+            self.taken += 1
+        self._last = time.monotonic()
+        self._cost = self._last - sealed
+        self.seconds += self._last - began

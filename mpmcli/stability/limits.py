@@ -6,6 +6,7 @@ to the other transfer schemes.
 """
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 # Largest displacement in one step, cells: keeps a particle's stencil local (docs/theory.md, 6.3).
@@ -36,17 +37,11 @@ FIX = {
 
 
 class Limit(NamedTuple):
-    """One bound on the time step.
+    """One bound on the time step."""
 
-    Attributes:
-        value: the largest step that it allows, s.
-        name: "wave", "viscosity", "speed", "deformation", "force", "collider", "maximum" or "forced".
-        body: name of the body that sets it, "" where no single one does.
-    """
-
-    value: float
-    name: str
-    body: str
+    value: float  # the largest step that it allows, s
+    name: str  # one of WHY
+    body: str  # name of the body that sets it, "" where no single one does
 
     @property
     def why(self) -> str:
@@ -66,16 +61,9 @@ def mode_limit(
 
     With a = 4 dt / (h^2 density) its velocity gradient obeys C' = C - a tau, where tau = stiffness e + viscosity C,
     and then e' = e + dt C'. That is stable while dt^2 stiffness + 2 dt viscosity <= density h^2; at rest the
-    stiffness is d lambda + 2 mu for a solid and d K for a fluid, and the viscosity 2 density nu in shear.
-
-    Args:
-        spacing: h, m.
-        density: kg/m^3, at rest.
-        stiffness, viscosity: Pa and Pa s, see `Mode`.
-        inertia: factor of density h^2 by the scheme, see `transfer_factors.step_inertia`.
-
-    Returns:
-        The step, and "wave" or "viscosity", whichever term is the larger one at that step.
+    stiffness, Pa, is d lambda + 2 mu for a solid and d K for a fluid, and the viscosity, Pa s, 2 density nu in shear,
+    see `Mode`. The density, kg/m^3, is that at rest; `inertia` is a factor of density h^2 by the scheme, see
+    `transfer_factors.step_inertia`. What binds is "wave" or "viscosity", the larger of the two terms at that step.
     """
     inertia = inertia * density * spacing**2
     # The root in the form that neither cancels nor overflows.
@@ -87,19 +75,17 @@ def mode_limit(
 
 
 def speed_limit(spacing: float, speed: float, gravity: float) -> float:
-    """Return the step in which the fastest particle moves COURANT cells, s.
+    """Return the step in which the fastest particle moves COURANT cells, s, by h, m, its speed, m/s, and |g|, m/s^2."""
+    return math.inf if speed == 0 and gravity == 0 else crossing_step(spacing, speed, gravity)
+
+
+def crossing_step(spacing: float, speed: float, gravity: float, sqrt: Callable = math.sqrt) -> float:
+    """Return `speed_limit` where anything moves, s; kernels call it with numbers and a root of their own.
 
     It solves speed dt + gravity dt^2 = COURANT h: gravity adds to the speed before the particle moves.
-
-    Args:
-        spacing: h, m.
-        speed: of the fastest particle, m/s.
-        gravity: its magnitude, m/s^2.
     """
-    if speed == 0 and gravity == 0:
-        return math.inf
     # The root in the form that neither cancels nor divides by zero.
-    return 2 * COURANT * spacing / (speed + math.sqrt(speed * speed + 4 * gravity * COURANT * spacing))
+    return 2 * COURANT * spacing / (speed + sqrt(speed * speed + 4 * gravity * COURANT * spacing))
 
 
 def deformation_limit(gradient: float) -> float:

@@ -54,13 +54,9 @@ def impact_loss(settings: SolverSettings, cells: float, mach: float, courant: fl
 
     Bodies meet about two cells early, where their kernels couple them softly. The nodes between them see the jump of
     velocity in each step until the gap is closed: the loss counts the steps of that time, and the layers that lose are
-    about a cell thick whatever the length of the bodies (docs/theory.md, 2.5).
-
-    Args:
-        settings: transfer and kernel.
-        cells: length of each body in the direction of the impact, in cells; of one before a wall.
-        mach: speed of each relative to their mean, or to the wall, over their wave speed.
-        courant: wave speed times step over spacing.
+    about a cell thick whatever the length of the bodies (docs/theory.md, 2.5). `cells` is the length of each body in
+    the direction of the impact, or of one before a wall, `mach` the speed of each relative to their mean, or to the
+    wall, over their wave speed, and `courant` the wave speed times step over spacing.
     """
     factor = APIC_LOSS[settings.kernel] / APIC_LOSS["quadratic"]
     if settings.transfer == "aflip":

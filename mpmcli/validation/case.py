@@ -13,8 +13,8 @@ from typing import Any, ClassVar, Literal
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.scene import Scene
-from mpmcli.validation.tables import Tables
 
+Tables = dict[str, Any]  # of a scene, as in a TOML file
 Level = Literal["coarse", "default", "fine"]
 Levels = dict[Level, tuple[int, ...]]
 Frames = Iterable[tuple[Frame, LedgerRow]]
@@ -50,10 +50,6 @@ class Setting:
         changed = [(knob, value) for knob, value in asdict(self).items() if value != getattr(Setting(), knob)]
         return ", ".join(KNOBS[knob].get(value, f"{knob} {value}") for knob, value in changed) or "default"
 
-    def solver_table(self) -> Tables:
-        """Return the table [solver] of a scene."""
-        return {name: getattr(self, name) for name in ("precision", "kernel", "transfer")}
-
 
 @dataclass(frozen=True)
 class Measure:
@@ -66,7 +62,7 @@ class Measure:
     order: float | None = None
     expected: float | None = None  # the theoretical order, shown in the report
     # The finest resolution used for the order. At finer ones another error dominates, as the note of the case explains.
-    order_to: int | None = None
+    order_to: float = math.inf
     # The |value| that rounding alone may make in single precision; a larger one may be 1.2 times that of double.
     rounding: float | Callable[[int], float] = 1e-4
 
@@ -85,10 +81,6 @@ class Measure:
     def rounding_at(self, n: int) -> float:
         """Return the |value| that rounding alone may make in single precision at resolution n."""
         return self.rounding(n) if callable(self.rounding) else self.rounding
-
-    def has_order_at(self, n: int) -> bool:
-        """Return whether resolution n is used for the order."""
-        return self.order_to is None or n <= self.order_to
 
     @property
     def unit_suffix(self) -> str:
@@ -157,11 +149,12 @@ class Case(ABC):
         """Return the scene at resolution n, as the tables of a TOML file."""
         tables = self.tables(n)
         per_cell = (self.finer * setting.per_axis) ** len(tables["domain"]["size"])
+        schemes = {name: getattr(setting, name) for name in ("precision", "kernel", "transfer")}
         return {
             "title": self.title,
             **tables,
             "time": {**tables["time"], "safety": setting.safety},
-            "solver": {**setting.solver_table(), "solids": self.solids, "f_bar": self.f_bar},
+            "solver": {**schemes, "solids": self.solids, "f_bar": self.f_bar},
             "bodies": [{**body, "particles_per_cell": per_cell} for body in tables["bodies"]],
         }
 

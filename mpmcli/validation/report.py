@@ -1,31 +1,50 @@
 """The report of a validation: cases, verdicts and costs, as JSON, as a table, and as a page with figures."""
 
+import io
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mpmcli.errors import RunError
 from mpmcli.output.durable import sealed, write_text
 from mpmcli.plain_text import counted, markdown_table, text_table
-from mpmcli.validation.case import Case, Level, Setting
-from mpmcli.validation.figures import draw_case
-from mpmcli.validation.runs import Results
-from mpmcli.validation.study import FIGURES, PAGE
+from mpmcli.plot.style import LIGHT_SERIES, empty_figure
+from mpmcli.validation.case import KNOBS, Case, Level, Setting
+from mpmcli.validation.runs import FIGURES, PAGE, Results, variants
 from mpmcli.validation.verdict import ROUND_OFF, Verdict, judge, order_of
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 TEMPLATE = Path(__file__).parent / "page" / "report.md"
 # Columns of the table of cases, of that of settings, and of that of runs around the measures.
 CASES = ("case", "problem", "verdict", "error", "at n", "order (expected)", "seconds")
 SETTINGS = ("setting", "error", "seconds", "runs that failed")
 RUN, COSTS = ("setting", "n"), ("particles", "steps", "seconds", "M particle-steps/s", "compile s", "outcome")
+# The figures: their size, inches, and their style.
+SIZE = (10.0, 4.8)
+STYLE = Path(__file__).parent / "page" / "figures.mplstyle"
+# Ordinate of a zero error.
+LOWEST = 1e-17
+COURANT = "Courant fraction"
+GREY = {"color": "#777777", "linewidth": 1.0, "linestyle": ":"}
+VARIANTS = [variant.label for knob in KNOBS if knob != "safety" for variant in variants(knob)]
+# Lines of the settings, the same in every figure; single precision usually coincides with double.
+LOOKS: dict[str, dict[str, Any]] = {Setting().label: {"color": "black", "marker": "o", "linewidth": 2.0, "zorder": 3}}
+LOOKS |= {
+    label: {"color": color, "marker": marker, "linewidth": 1.2}
+    for label, color, marker in zip(VARIANTS, LIGHT_SERIES, "s^vDph<", strict=False)
+}
+LOOKS["f32"] |= {"markersize": 9, "markerfacecolor": "none", "linestyle": "--"}
+LOOKS[COURANT] = {**GREY, "marker": "d"}
 
 
 @dataclass(frozen=True)
 class CaseReport:
-    """One case in the report: its runs and verdict; `order` is observed with the default setting, or None."""
+    """One case in the report: its runs and verdict."""
 
     case: Case
     results: Results
@@ -35,15 +54,11 @@ class CaseReport:
         """The checks of the case."""
         return judge(self.case, self.results)
 
-    @property
-    def order(self) -> float | None:
-        """Observed order of the error with the default setting, between the two finest runs that have one."""
-        return order_of(self.case.measures[0], self.results)
-
     def summary(self) -> tuple[str, ...]:
         """Return the row of the case in the table of cases: its finest run with the default setting that finished."""
         measure = self.case.measures[0]
-        order = "" if self.order is None else f"{self.order:.2f}"
+        observed = order_of(measure, self.results)
+        order = "" if observed is None else f"{observed:.2f}"
         if measure.expected is not None:
             order = f"{order or '-'} ({measure.expected:g})"
         error = n = seconds = ""
@@ -62,7 +77,7 @@ class CaseReport:
             "measures": [{name: getattr(m, name) for name in ("name", "unit", "text")} for m in case.measures],
             "verdict": self.verdict.word,
             "reasons": self.verdict.reasons,
-            "order": self.order,
+            "order": order_of(case.measures[0], self.results),
             "expected_order": case.measures[0].expected,
             "checks": [{**asdict(check), "setting": check.setting.label} for check in self.verdict.checks],
             "runs": [
@@ -139,25 +154,12 @@ class Report:
         failed = f", of which {unfinished} did not finish" if unfinished else ""
         return f"{passed} of {len(self.cases)} cases pass. {counted(len(self.results), 'run')}{failed}."
 
-    def machine(self) -> str:
-        """Return the line on program, level and machine."""
-        facts = self.environment
-        return (
-            f"mpmcli {facts['mpmcli']}, level {self.level}, {facts['date']}. {facts['processor']}, 1 thread per run, "
-            f"{counted(facts['workers'], 'run')} at a time; Python {facts['python']}, Taichi {facts['taichi']}, "
-            f"{facts['system']}."
-        )
-
     def text(self) -> str:
         """Return a text table with a line per case, followed by the failed checks."""
         table = text_table(CASES, [entry.summary() for entry in self.case_reports], left={0, 1, 2})
         failed = "\n".join(self.reasons())
         closing = f"{self.outcome()} Errors, orders and seconds are those of the default setting."
         return "\n\n".join(filter(None, [table, failed, closing]))
-
-    def summary(self) -> str:
-        """Return the table of cases as Markdown."""
-        return markdown_table(CASES, [entry.summary() for entry in self.case_reports], left={0, 1, 2})
 
     def settings(self) -> str:
         """Return a table of error and time of every setting over those of the default one at equal n, as Markdown."""
@@ -175,11 +177,17 @@ class Report:
 
     def page(self) -> str:
         """Return the page as Markdown, with links to figures in the directory FIGURES."""
+        facts = self.environment
+        machine = (
+            f"mpmcli {facts['mpmcli']}, level {self.level}, {facts['date']}. {facts['processor']}, 1 thread per run, "
+            f"{counted(facts['workers'], 'run')} at a time; Python {facts['python']}, Taichi {facts['taichi']}, "
+            f"{facts['system']}."
+        )
         failed = f"## What failed\n\n{bullets(self.reasons())}\n\n" if self.reasons() else ""
         return TEMPLATE.read_text(encoding="utf-8").format(
-            machine=self.machine(),
+            machine=machine,
             outcome=self.outcome(),
-            summary=self.summary(),
+            summary=markdown_table(CASES, [entry.summary() for entry in self.case_reports], left={0, 1, 2}),
             failed=failed,
             settings=self.settings(),
             cases="\n\n".join(entry.page() for entry in self.case_reports),
@@ -210,3 +218,53 @@ def _ratios(pairs: Iterable[tuple[float, float]], least: float) -> str:
 def bullets(lines: Iterable[str]) -> str:
     """Return a list in Markdown."""
     return "\n".join(f"* {line}" for line in lines)
+
+
+def draw_case(case: Case, results: Results) -> bytes:
+    """Return the figure of a case: error against resolution and processor time, as SVG; equal results, equal bytes."""
+    measure = case.measures[0]
+    with empty_figure(SIZE, STYLE, {}, (0.1, 0.1)) as figure:
+        order, cost = figure.subplots(1, 2, sharey=True, subplot_kw={"xscale": "log", "yscale": "log"})
+        for label, runs in _lines(results).items():
+            finished = {run: result for run, result in runs.items() if result.finished}
+            errors = [max(result.error(measure.name), LOWEST) for result in finished.values()]
+            failed = len(runs) - len(finished)
+            named = f"{label} ({failed} failed)" if failed else label
+            cost.plot([result.seconds for result in finished.values()], errors, label=named, **LOOKS[label])
+            if label != COURANT:
+                order.plot([run.n for run in finished], errors, **LOOKS[label])
+        _draw_bounds(order, case, results)
+        named = f"{measure.name} ({measure.unit})" if measure.unit else measure.name
+        order.set(title="Error against resolution", xlabel=f"n, {case.resolution}", ylabel=named)
+        resolutions = sorted({run.n for run in results})
+        order.set_xticks(resolutions, [str(n) for n in resolutions])
+        order.xaxis.minorticks_off()
+        cost.set(title="Error against processor time", xlabel="seconds of stepping, one thread")
+        figure.legend(loc="outside lower center", ncols=4)
+        content = io.BytesIO()
+        figure.savefig(content, format="svg", metadata={"Date": None, "Creator": None})
+    return content.getvalue()
+
+
+def _lines(results: Results) -> dict[str, Results]:
+    """Return the results of each line, by its label; Courant fractions share one."""
+    lines: dict[str, Results] = {}
+    for run, result in results.items():
+        label = COURANT if run.setting.label.startswith(COURANT) else run.setting.label
+        lines.setdefault(label, {})[run] = result
+    return lines
+
+
+def _draw_bounds(axes: "Axes", case: Case, results: Results) -> None:
+    """Draw the bounds of the default setting, and the slope that theory expects below its finest error."""
+    measure, observed = case.measures[0], order_of(case.measures[0], results)
+    usual = {run.n: result for run, result in results.items() if run.setting == Setting()}
+    bounds = [(n, measure.bound(n)) for n in usual if 0 < measure.bound(n) < float("inf")]
+    if bounds:
+        axes.plot(*zip(*bounds, strict=True), "_", color="#444444", markersize=16, label="bound of the default setting")
+    finished = [(n, max(result.error(measure.name), LOWEST)) for n, result in usual.items() if result.finished]
+    if measure.expected is not None and len(finished) > 1:
+        finest, error = finished[-1]
+        slope = [error * (finest / n) ** measure.expected / 2 for n in usual]
+        label = f"slope of order {measure.expected:g}" + ("" if observed is None else f", observed {observed:.2f}")
+        axes.plot([*usual], slope, label=label, **GREY)

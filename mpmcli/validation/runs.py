@@ -1,21 +1,36 @@
-"""The runs of a level, each case at its resolutions with the default setting and its variants; and one run."""
+"""The runs of a level, each case at its resolutions and settings, carried out in processes of their own, and kept."""
 
+import hashlib
+import json
 import math
+import os
 import time
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import cache
+from pathlib import Path
 from typing import Literal
 
-from mpmcli.errors import MpmcliError
+from mpmcli.bench.report import describe_machine
+from mpmcli.errors import InputError, MpmcliError, RunError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.materials.registry import parameter_models
+from mpmcli.output.directory import check_directory
+from mpmcli.output.durable import write_text
+from mpmcli.processes.pool import Fault, in_processes
 from mpmcli.scene import Scene, parse_scene
-from mpmcli.solver.engine.build import build_run
 from mpmcli.solver.engine.run import Run as SolverRun
+from mpmcli.solver.engine.run import build_run
 from mpmcli.solver.frames.diagnosis import UnstableRunError
 from mpmcli.solver.machine.backend import Backend, start_backend
 from mpmcli.validation.case import KNOBS, Case, Level, Setting
+from mpmcli.validation.cases import all_cases
+
+PACKAGE = Path(__file__).resolve().parent.parent
+RESULTS, PAGE, FIGURES = "results.json", "report.md", "figures"
+# Numpy in the process of a run takes one thread, so that concurrent runs do not compete for cores.
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
 @dataclass(frozen=True)
@@ -87,19 +102,14 @@ Results = Mapping[Run, RunResult]
 
 
 def scene_of(case: Case, n: int, setting: Setting) -> Scene:
-    """Return the scene of a case at resolution n.
-
-    Raises:
-        InputError: the scene is not valid.
-    """
+    """Return the scene of a case at resolution n; InputError where it is not valid."""
     return parse_scene(case.scene_tables(n, setting), laws=parameter_models(), source=f"<{case.name}>").scene
 
 
 def carry_out(case: Case, n: int, setting: Setting, backend: Backend | None = None) -> RunResult:
-    """Run a case and return its measures. Errors are reported in the result.
+    """Run a case and return its measures; errors are reported in the result.
 
-    Args:
-        backend: the backend; None starts the CPU backend with one thread in the precision of the setting.
+    Without a backend that of the CPU is started, with one thread in the precision of the setting.
     """
     try:
         scene = scene_of(case, n, setting)
@@ -146,3 +156,68 @@ class SteppingClock:
             if found is None:
                 return
             yield found
+
+
+def carry_out_run(run: Run) -> RunResult:
+    """Carry out a run in this process."""
+    return carry_out(all_cases()[run.case], run.n, run.setting)
+
+
+def carry_out_all(
+    runs: Sequence[Run],
+    workers: int,
+    timeout: float = 1800.0,
+    stop: Callable[[], object] = lambda: False,
+    work: Callable[[Run], RunResult] = carry_out_run,
+) -> Iterator[tuple[Run, RunResult]]:
+    """Yield (run, result) as runs end; see `in_processes`. A crash, or more than `timeout` s, is reported."""
+    os.environ.update(ONE_THREAD)
+    for run, answer in in_processes(runs, workers, work, timeout, stop):
+        yield run, RunResult("failed", f"The run failed: {answer.words}.") if isinstance(answer, Fault) else answer
+
+
+class Journal:
+    """The results of earlier runs in the directory of a report, by the digest of all that a run depends on."""
+
+    def __init__(self, directory: Path, *, resume: bool = False, overwrite: bool = False) -> None:
+        """Make the directory, or read the results in it, or clear it; InputError where it cannot be used."""
+        check_directory(directory, overwrite, resume=resume)
+        self._file = directory / RESULTS
+        self._kept: dict[str, dict] = {}
+        try:
+            directory.mkdir(parents=True, exist_ok=True)
+            if overwrite:
+                for path in (self._file, directory / PAGE, *directory.glob(f"{FIGURES}/*.svg")):
+                    path.unlink(missing_ok=True)
+            elif self._file.exists():
+                self._kept = json.loads(self._file.read_text(encoding="utf-8"))
+        except (OSError, ValueError) as error:
+            reason = getattr(error, "strerror", None) or error
+            raise InputError(f"{directory} cannot be used ({reason}): give another place with -o.") from error
+
+    def find(self, run: Run) -> RunResult | None:
+        """Return the result of a run by the same program on this processor; None for a failure, such as a late run."""
+        found = self._kept.get(run_key(run))
+        return None if found is None or found["status"] == "failed" else RunResult(**found)
+
+    def keep(self, run: Run, result: RunResult) -> None:
+        """Store the result of a run; RunError where that fails."""
+        self._kept[run_key(run)] = asdict(result)
+        try:
+            write_text(self._file, json.dumps(self._kept, indent=1) + "\n")
+        except OSError as error:
+            raise RunError(f"{self._file} could not be written ({error.strerror or error}).") from error
+
+
+def run_key(run: Run) -> str:
+    """Return the digest of a run: its case, its scene, the program, and the processor, on which times depend."""
+    scene = all_cases()[run.case].scene_tables(run.n, run.setting)
+    return hashlib.sha256(json.dumps([run.case, run.n, scene, *_program()]).encode()).hexdigest()
+
+
+@cache
+def _program() -> tuple[str, ...]:
+    sources = sorted(path for path in PACKAGE.rglob("*") if path.is_file() and path.suffix != ".pyc")
+    digest = hashlib.sha256(b"\0".join(path.read_bytes() for path in sources)).hexdigest()
+    machine = describe_machine()
+    return digest, machine["taichi"], machine["processor"]

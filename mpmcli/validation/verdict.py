@@ -25,7 +25,7 @@ def observed_order(points: list[tuple[int, float]]) -> float | None:
 def order_of(measure: Measure, results: Results) -> float | None:
     """Return the order of a measure with the default setting, between the two finest resolutions that have one."""
     usual = [(run.n, result) for run, result in results.items() if run.setting == Setting() and result.finished]
-    return observed_order([(n, result.error(measure.name)) for n, result in usual if measure.has_order_at(n)])
+    return observed_order([(n, result.error(measure.name)) for n, result in usual if n <= measure.order_to])
 
 
 @dataclass(frozen=True)

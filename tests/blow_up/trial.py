@@ -9,7 +9,7 @@ import numpy as np
 from blow_up.scenes import SPACING, BlowUpScene
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import BodyParticles, Scene, parse_scene
-from mpmcli.solver.engine.build import build_run
+from mpmcli.solver.engine.run import build_run
 from mpmcli.solver.frames.diagnosis import UnstableRunError
 from mpmcli.solver.machine.backend import Backend
 from mpmcli.stability.limits import Limit

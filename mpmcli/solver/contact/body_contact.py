@@ -17,8 +17,7 @@ from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
 from mpmcli.scene.sampling import lattice_spacing
 from mpmcli.solver.contact.layers import Layers
-from mpmcli.solver.contact.obstacles import FAR, REACH, place_of
-from mpmcli.solver.contact.surfaces import BodySurfaces
+from mpmcli.solver.contact.surfaces import FAR, REACH, BodySurfaces, place_of
 from mpmcli.solver.grid.grid import Grid
 from mpmcli.solver.particles.arrays import ParticleArrays
 from mpmcli.solver.particles.sort import TileOrder, stay_rolled
@@ -58,7 +57,7 @@ class BodyContact:
     """What the bodies of a batch do to each other, and obstacles to them; w is the number of a run.
 
     Attributes:
-        surfaces: what they show; layers: of each run; room: surface points near a node, of each body.
+        surfaces: what they show; layers: of each run; capacity: surface points near a node, of each body.
         rows: of each layer of each run its numbers, see MODULUS.
         loads: what the first layer of each pair takes from the second, about the lower corner, see `Layers.pairs`.
         extremes: of each run since the last frame the deepest overlap and the largest gap that acted, cells.
@@ -79,11 +78,11 @@ class BodyContact:
         self.surfaces = BodySurfaces(groups, orders, grid, layers, runs)
         self.dimension, self.layers, self.node_count = grid.dimension, layers.count, grid.node_count
         # Two layers of particles, at four times the density of those at rest.
-        self.room = 8 * math.ceil((grid.scheme.spline.nodes * layers.per_axis) ** (grid.dimension - 1))
+        self.capacity = 8 * math.ceil((grid.scheme.spline.nodes * layers.per_axis) ** (grid.dimension - 1))
         self.rows = ti.field(float, shape=(runs * layers.count, FRICTION + layers.count))
         self.loads = Loads(max(1, layers.pairs), grid.shape, runs, on_cpu=True)
         self.extremes = ti.field(float, shape=(runs, len(EXTREMES)))
-        self.share = (2 * grid.dimension + 2) * self.room
+        self.share = (2 * grid.dimension + 2) * self.capacity
         self.points = ti.field(float, shape=2 * max(runs, threads) * self.share + LANES)
 
     def write(self, scene: Scene, run: int = 0) -> None:
@@ -103,11 +102,13 @@ class BodyContact:
                 self.rows[run * self.layers + layer, k] = number
 
     @ti.func
-    def sum_up(self, run: int, frame: int, column: int, notes: ti.template()):
-        """Store the loads and then the extremes of a run in notes[run, frame], from a column on, and forget them."""
-        self.loads.sum_up(run, frame, column, notes)
+    def sum_up(self, run: int, frame: int, column: int, frame_stats: ti.template()):
+        """Store the loads and then the extremes of a frame, from a column on, and forget them."""
+        self.loads.sum_up(run, frame, column, frame_stats)
         for k in ti.static(range(len(EXTREMES))):
-            notes[run, frame, column + ti.static(self.loads.room * self.loads.width) + k] = self.extremes[run, k]
+            frame_stats[run, frame, column + ti.static(self.loads.capacity * self.loads.width) + k] = self.extremes[
+                run, k
+            ]
             self.extremes[run, k] = 0.0
 
     @ti.func
@@ -362,14 +363,14 @@ class BodyContact:
                                 slopes[side, b] += weight * self.surfaces.surface[g][p][d + 1 + b]
                             depth = self.surfaces.surface[g][p][d]
                             near = depth < self.rows[w * self.layers + layer, DISTANCE]
-                            if near and counts[side] < self.room:
+                            if near and counts[side] < self.capacity:
                                 way -= depth * n
                                 at = (2 * thread + side) * self.share + counts[side]
                                 for b in ti.static(range(d)):
-                                    self.points[at + b * self.room] = outwards * way[b]
-                                    self.points[at + ti.static(d + 1 + b) * self.room] = outwards * n[b]
-                                self.points[at + d * self.room] = way.norm_sqr() / (2.0 * BALL * h)
-                                self.points[at + ti.static(2 * d + 1) * self.room] = weight
+                                    self.points[at + b * self.capacity] = outwards * way[b]
+                                    self.points[at + ti.static(d + 1 + b) * self.capacity] = outwards * n[b]
+                                self.points[at + d * self.capacity] = way.norm_sqr() / (2.0 * BALL * h)
+                                self.points[at + ti.static(2 * d + 1) * self.capacity] = weight
                                 counts[side] += 1
                         p = self.surfaces.following[g][p]
         for side, b in ti.static(ti.ndrange(2, d)):
@@ -398,10 +399,10 @@ class BodyContact:
             agree = ti.min(agree, normal.dot(facing))
             at = (2 * thread + 1) * self.share + k
             for b in ti.static(range(d)):
-                self.points[at + b * self.room] = point[b] - x[b]
-                self.points[at + ti.static(d + 1 + b) * self.room] = -normal[b]
-            self.points[at + d * self.room] = (x - point).norm_sqr() * (0.5 / BALL) / h
-            self.points[at + ti.static(2 * d + 1) * self.room] = 1.0
+                self.points[at + b * self.capacity] = point[b] - x[b]
+                self.points[at + ti.static(d + 1 + b) * self.capacity] = -normal[b]
+            self.points[at + d * self.capacity] = (x - point).norm_sqr() * (0.5 / BALL) / h
+            self.points[at + ti.static(2 * d + 1) * self.capacity] = 1.0
             k += 1
         return way, facing, velocity, friction, agree
 
@@ -431,7 +432,7 @@ class BodyContact:
         total, begin = ti.Vector.zero(float, d), 0
         while begin < count:
             points, found = zero_lanes(ti.static(d + 1)), ti.Vector.zero(float, LANES)
-            self.load(first + ti.static(d + 1) * self.room + begin, points)
+            self.load(first + ti.static(d + 1) * self.capacity + begin, points)
             for lane in range(LANES):
                 along = -1.0
                 for b in ti.static(range(d)):
@@ -449,7 +450,7 @@ class BodyContact:
         first = bounded(origin)
         for k in ti.static(range(points.n)):
             for lane in range(LANES):
-                points[k, lane] = self.points[first + k * self.room + lane]
+                points[k, lane] = self.points[first + k * self.capacity + lane]
 
 
 @ti.func

@@ -132,7 +132,7 @@ class TimeTables:
 
     def __init__(self, runs: int, numbers: int) -> None:
         self._numbers = numbers
-        self.rows = double_field(runs * numbers, ROOM, width=COLUMNS)
+        self.rows = double_field(runs * numbers, ROOM, entries=(COLUMNS,))
         self.used = ti.field(int, shape=runs * numbers)
 
     def fill(self, run: int, means: Sequence[Mean], since: float, *, coarse: bool) -> float:
@@ -147,7 +147,7 @@ class TimeTables:
             rows: list[np.ndarray] = []
             count, before = 0, 0.0
             while k < first + ahead:
-                own = thinned(mean.rows(k), ROOM // (ahead if coarse else 2))
+                own = subsampled(mean.rows(k), ROOM // (ahead if coarse else 2))
                 count += len(own)
                 if count > ROOM:
                     break
@@ -207,7 +207,7 @@ def _integral(row: np.ndarray) -> float:
     return float(row[COEFFICIENTS:].sum())
 
 
-def thinned(rows: np.ndarray, most: int) -> np.ndarray:
+def subsampled(rows: np.ndarray, most: int) -> np.ndarray:
     """Return at most so many rows for those of a window: neighbours are joined, and the integral is linear in each."""
     if len(rows) <= most:
         return rows

@@ -185,7 +185,7 @@ class DriveValues:
 
 
 class HostValues:
-    """What `DriveValues` computes in kernels, on the host: for devices without double precision."""
+    """What `DriveValues` computes in kernels, on the host, where devices without double precision need it."""
 
     motions = ()
 
@@ -239,7 +239,7 @@ class GroupForce:
         self.dimension, self.terms = dimension, _nodes_of(forces, values)
         self.moves, self.spreads = forces.moves, forces.moves and not forces.initial
         self.reach, self.slope = node_of(forces.reach, values), node_of(forces.slope, values)
-        self.room = room
+        self.capacity = room
 
     @ti.func
     def at(self, group: ti.template(), p: int, x: ti.template(), X: ti.template()):
@@ -249,7 +249,7 @@ class GroupForce:
                 for axis, node in ti.static(axes):
                     result[axis] += node.evaluate(x, X, group.run)
             else:
-                if group.body[p] - group.run * self.room == ti.static(place):
+                if group.body[p] - group.run * self.capacity == ti.static(place):
                     for axis, node in ti.static(axes):
                         result[axis] += node.evaluate(x, X, group.run)
         return result
@@ -361,52 +361,27 @@ def push_on(
 
 
 class ExternalForces:
-    """Bounds on gravity and forces of a scene, by measurements of the force on each group that one acts on.
+    """Measurements of the force on each group that one acts on.
 
-    slope: largest row sum of |da/dx| of the forces, 1/s^2, as last measured, margin included.
+    pushes: whether there are any.
     """
 
-    def __init__(self, scene: Scene, values: RunValues, measures: Sequence[Callable[[], tuple[float, float]]]) -> None:
-        self._domain = scene.domain
-        self._gravity_pull = float(np.linalg.norm(scene.domain.gravity_at(0.0)))
-        self._values, self._measures = values, measures
-        self._push = 0.0
-        self.slope = 0.0
+    def __init__(self, values: RunValues, measures: Sequence[Callable[[], tuple[float, float]]]) -> None:
+        self._values, self._measures, self.pushes = values, measures, bool(measures)
 
-    @property
-    def pushes(self) -> bool:
-        return bool(self._measures)
+    def measure(self, time: float, ahead: float) -> tuple[float, float]:
+        """Measure where the particles are, from a time on up to the next measurement, `ahead` s later.
 
-    @property
-    def steady_pull(self) -> float:
-        """A bound on the acceleration, m/s^2, by gravity, if it is steady, and by forces as measured."""
-        return (self._gravity_pull if self._domain.steady else 0.0) + self._push
-
-    def save(self) -> dict[str, float]:
-        return {"push": self._push, "slope": self.slope}
-
-    def load(self, saved: dict[str, float]) -> None:
-        self._push, self.slope = saved["push"], saved["slope"]
-
-    def pull(self, start: float, end: float) -> float:
-        """Return a bound on the acceleration between two times (s): gravity by its bounds, forces as measured."""
-        if self._domain.steady:
-            return self.steady_pull
-        return float(np.linalg.norm([largest_of(tree_of(g), start, end) for g in self._domain.gravity])) + self._push
-
-    def measure(self, time: float, ahead: float) -> None:
-        """Measure the forces where the particles are, from a time on up to the next measurement, `ahead` s later."""
-        if not self._measures:
-            return
+        Returns:
+            The largest force over mass, m/s^2, and the largest row sum of its slope |da/dx|, 1/s^2, margin included.
+        """
         times = [time]
         if self._values.timed and ahead > 0:
             times = [*np.linspace(time, time + ahead, INSTANTS), *self._values.telling_times(time, time + ahead)]
-        found = []
-        for instant in times:
+        found = [(0.0, 0.0)]
+        for instant in times if self.pushes else ():
             if self._values.timed:
                 self._values.write(float(instant), float(instant))
             found += [measure() for measure in self._measures]
-        self._push, self.slope = (
-            MARGIN * max((value for value in values if math.isfinite(value)), default=0.0)
-            for values in zip(*found, strict=True)
-        )
+        push, slope = (MARGIN * max(filter(math.isfinite, values)) for values in zip(*found, strict=True))
+        return push, slope

@@ -1,6 +1,5 @@
 """One run or many in one process: what they share on the device."""
 
-import math
 import sys
 import time
 from collections import Counter
@@ -19,14 +18,15 @@ from mpmcli.boundaries.walls import MovingFaces, RoughFaces, Walls, faces_on_gri
 from mpmcli.errors import InputError, RunError
 from mpmcli.quick_taichi import ti
 from mpmcli.solver.contact.body_contact import EXTREMES, BodyContact
-from mpmcli.solver.drive.forces import DriveValues, Gravity, RigidDrive, push_on
+from mpmcli.solver.contact.total_solids import DRIFT, contact_between, slips_in
+from mpmcli.solver.drive.forces import DriveValues, Gravity, HostValues, RigidDrive, push_on
 from mpmcli.solver.engine.compiled_kind import CompiledKind
 from mpmcli.solver.engine.cpu_launch import CpuLaunch
 from mpmcli.solver.engine.device import Device
 from mpmcli.solver.engine.gpu_launch import GpuLaunch
 from mpmcli.solver.engine.kernel_store import StoredLaunch
-from mpmcli.solver.engine.run_numbers import MOST_FRAMES, NOTES, Layout
-from mpmcli.solver.engine.step_control import HOLD, RISE
+from mpmcli.solver.engine.run_state import FRAME_NUMBERS, MOST_FRAMES, Layout, RunState
+from mpmcli.solver.engine.step_size import StepSize
 from mpmcli.solver.frames.reader import sum_entries
 from mpmcli.solver.grid.fixed_point import FixedPoint
 from mpmcli.solver.grid.grid import Grid, drift_allowed, node_width, tile_edge
@@ -43,13 +43,11 @@ from mpmcli.solver.machine.backend import Backend
 from mpmcli.solver.particles.arrays import CONSTANTS, ParticleArrays
 from mpmcli.solver.particles.inflow import Emission
 from mpmcli.solver.particles.sort import SortBuffers, TileOrder
-from mpmcli.solver.solids.contact import DRIFT, contact_between
-from mpmcli.solver.solids.reference_grid import slips_in
 from mpmcli.solver.transfer.node_update import NodeUpdate
 from mpmcli.solver.transfer.particle_update import BEYOND, ParticleUpdate
 from mpmcli.solver.transfer.redistribution import FineBlocks, FineGrid
 from mpmcli.solver.transfer.splines import PAD, scheme_of
-from mpmcli.solver.transfer.volume_average import averages_volume
+from mpmcli.solver.transfer.volume import averages_volume
 
 # Room for blocks of a sparse grid, of those that particles reach, when there are more of them than fit.
 GROWTH = 2
@@ -64,11 +62,11 @@ class Batch:
         kind: what was compiled, with the room for each run.
         runs: number of runs.
         device: all of it.
-        layout: columns of `numbers`, (runs, k) float64, and `counts`, (runs, l) int32, which the kernel reads and
-            changes.
-        shown: what particles show at the frames that the last launch recorded, on the CPU: (rows, k), as many rows for
-            each run; notes: on each of these frames, (runs, MOST_FRAMES, NOTES and sums of each law), float64.
-        values: numbers that expressions read.
+        layout: columns of `numbers`, (runs, k) float64, and `counts`, (runs, l) int32, see `run_state`.
+        frame_buffer: what particles show at the frames that the last launch recorded, on the CPU: (rows, k), as many
+            rows for each run.
+        frame_stats: of each of these frames FRAME_NUMBERS, and sums of each law, (runs, MOST_FRAMES, k), float64.
+        values: numbers that expressions read; steps: what chooses steps, on the host.
         cpu, gpu: what launches steps, there or there; launch_cpu: the kernel of the one, compiled or stored.
         profile: where a Counter is put here, phases of the only run are launched one by one on the CPU, and their wall
             time is added by their names, s.
@@ -82,13 +80,13 @@ class Batch:
         self.kind, self.runs, self.backend = kind, runs, backend
         on_cpu = backend.on_cpu
         require_cpu_if_sparse(kind.settings, backend)
-        if kind.colliders.moving and not backend.doubles:
+        if (kind.colliders.moving or kind.colliders.free) and not backend.doubles:
             raise InputError(
                 f"colliders that move need double precision, which --arch {backend.arch} lacks; give --arch cpu"
             )
         # Many small runs on a GPU are in its cache, and use all nodes of their domains.
         sorts = on_cpu or runs == 1 or kind.inflow.any
-        scheme = scheme_of(kind.settings, keeps_before=kind.keeps_motion)
+        scheme = scheme_of(kind.settings, keeps_flip_velocity=kind.keeps_motion)
         averaged = [averages_volume(kind.settings, law) for law in kind.members]
         period = Period(kind.faces, runs, at_once=not on_cpu)
         deterministic = kind.settings.deterministic and not on_cpu
@@ -97,20 +95,20 @@ class Batch:
             ParticleArrays(
                 law,
                 d,
-                runs * room,
+                runs * capacity,
                 (runs * bodies, CONSTANTS + len(law.constants(law.members[0]))),
                 # Forces of a batch select the particles of their body.
-                several=runs > 1 or bodies > 1 or bool(forces.terms),
+                many_bodies=runs > 1 or bodies > 1 or bool(forces.terms),
                 serial=on_cpu and backend.threads == 1,
                 keeps_initial=forces.initial,
                 total=kind.settings.solids == "total",
-                averaged=shares,
-                slips=slips_in(kind.settings, kind.rough),
+                uses_f_bar=shares,
+                has_wall_friction=slips_in(kind.settings, kind.rough),
                 comes_and_goes=kind.inflow.any,
                 layers=kind.layers.count,
                 surfaced=kind.layers.separate and law.elastic,
             )
-            for law, shares, room, bodies, forces in zip(
+            for law, shares, capacity, bodies, forces in zip(
                 kind.members, averaged, kind.particles, kind.bodies, kind.drives.forces, strict=True
             )
         ]
@@ -162,30 +160,32 @@ class Batch:
             BodyContact(groups, orders, grid, kind.layers, runs, backend.threads) if kind.layers.separate else None,
             ti.field(int, shape=(2 * runs, d)) if on_cpu else None,
             sorts,
+            self._drift_allowed(grid, contact is not None),
         )
         internal = [len(law.internal) for law in kind.members]
         self.layout = Layout(d, internal, len(kind.inflow.groups), kind.bodies)
-        self.numbers = np.zeros((runs, self.layout.reals))
-        self.counts = np.zeros((runs, self.layout.counts), np.int32)
-        constants = {"drift_allowed": self._drift_allowed(grid, contact is not None)}
-        constants |= {"hold": HOLD, "rise": RISE, "slack": 1e-6, "infinity": math.inf}
-        for name, value in constants.items():
-            self.numbers[:, getattr(self.layout.real, name)] = value
+        self.numbers = np.zeros((runs, self.layout.widths["numbers"]))
+        self.counts = np.zeros((runs, self.layout.widths["counts"]), np.int32)
+        self.steps = StepSize.of(self.device, self.layout, HostValues(self.values))
         self.seconds = self.first_seconds = 0.0
         self.profile: Counter | None = None
-        self.shown = self._room = np.zeros((runs, 1), groups[0].real)
+        self.frame_buffer = self._buffer = np.zeros((runs, 1), groups[0].real)
         if on_cpu:
-            noted = [one.loads.room * one.loads.width for one in (colliders, self.device.contact) if one is not None]
+            noted = [
+                one.loads.capacity * one.loads.width for one in (colliders, self.device.contact) if one is not None
+            ]
             noted += [len(EXTREMES)] * kind.layers.separate
             noted += [rigid.count * (rigid.width + rigid.loads)] if rigid else []
-            self.notes = np.zeros((runs, MOST_FRAMES, len(NOTES) + len(groups) * sum_entries(d) + sum(noted)))
+            self.frame_stats = np.zeros(
+                (runs, MOST_FRAMES, len(FRAME_NUMBERS) + len(groups) * sum_entries(d) + sum(noted))
+            )
             self._build_cpu()
         else:
             self.gpu = GpuLaunch(self.device, self.layout, doubles=backend.doubles)
 
-    def _drift_allowed(self, grid: Grid, touches: bool) -> float:
+    def _drift_allowed(self, grid: Grid, has_contact: bool) -> float:
         """Return the cells that particles may drift before they are sorted."""
-        if touches:
+        if has_contact:
             return DRIFT
         if self.backend.on_cpu:
             return drift_allowed(grid.tile, grid.scheme.spline.nodes)
@@ -196,7 +196,7 @@ class Batch:
     def _make_grid(self, period: Period, blocks: int, *, deterministic: bool = False) -> Grid:
         """Return the grid; on a sparse one there is room for so many blocks."""
         kind, on_cpu = self.kind, self.backend.on_cpu
-        scheme = scheme_of(kind.settings, keeps_before=kind.keeps_motion)
+        scheme = scheme_of(kind.settings, keeps_flip_velocity=kind.keeps_motion)
         tile = tile_edge(scheme.spline.nodes, kind.dimension, on_cpu=on_cpu)
         sparse = {"blocks": blocks, "threads": self.backend.threads} if kind.sparse and on_cpu else {}
         grid = (SparseGrid if sparse else Grid)(
@@ -208,7 +208,7 @@ class Batch:
             self.runs,
             tile=tile,
             keeps_filling=kind.keeps_filling,
-            averaged=[averages_volume(kind.settings, law) for law in kind.members],
+            uses_f_bar=[averages_volume(kind.settings, law) for law in kind.members],
             period=period,
             opens=kind.inflow.opens,
             deterministic=deterministic,
@@ -239,13 +239,13 @@ class Batch:
         What the grid had stays allocated until the backend stops.
         """
         device = self.device
-        room = most_blocks(device.grid)
-        if blocks > room:
+        most = most_blocks(device.grid)
+        if blocks > most:
             raise RunError(
-                f"the material has spread over {blocks:,} blocks of the sparse grid, and there is memory for {room:,}; "
+                f"the material has spread over {blocks:,} blocks of the sparse grid, and there is memory for {most:,}; "
                 "a larger domain.spacing needs fewer."
             )
-        grid = self._make_grid(device.grid.period, min(GROWTH * blocks, room))
+        grid = self._make_grid(device.grid.period, min(GROWTH * blocks, most))
         nodes, particles = copy(device.nodes), copy(device.particles)
         nodes.grid = particles.grid = particles.near = grid
         orders = self._make_orders(device.groups, grid)
@@ -256,24 +256,28 @@ class Batch:
         self.cpu = CpuLaunch(self.device, self.layout)
         self.launch_cpu = StoredLaunch(self.cpu, self.kind, self.backend)
 
-    def make_room(self, rows: int, columns: int) -> None:
-        """Let each run have so many rows of `shown` from the next launch on."""
-        shape = max(rows * self.runs, len(self._room)), max(columns, self._room.shape[1])
-        if shape != self._room.shape:
-            self._room = np.empty(shape, self._room.dtype)
+    def state(self, slot: int | slice) -> RunState:
+        """Return the numbers of a run, or of some runs."""
+        return RunState(self.layout, self.numbers, self.counts, slot)
+
+    def reserve(self, rows: int, columns: int) -> None:
+        """Let each run have so many rows of `frame_buffer` from the next launch on."""
+        shape = max(rows * self.runs, len(self._buffer)), max(columns, self._buffer.shape[1])
+        if shape != self._buffer.shape:
+            self._buffer = np.empty(shape, self._buffer.dtype)
 
     def first_row(self, slot: int) -> int:
-        """Return the first row of a run in `shown`."""
-        return slot * (len(self.shown) // self.runs)
+        """Return the first row of a run in `frame_buffer`."""
+        return slot * (len(self.frame_buffer) // self.runs)
 
     def launch(self) -> None:
         """Advance every run until its host has to attend to it, or its budget of steps is spent."""
         began = time.perf_counter()
         if self.backend.on_cpu:
-            self.shown = self._room
-            self.counts[:, self.layout.count.recorded] = 0
-            self.counts[:, self.layout.count.row] = [self.first_row(slot) for slot in range(self.runs)]
-            arrays = self.numbers, self.counts, self.shown, self.notes
+            self.frame_buffer = self._buffer
+            every = self.state(slice(None))
+            every.recorded, every.row = 0, [self.first_row(slot) for slot in range(self.runs)]
+            arrays = self.numbers, self.counts, self.frame_buffer, self.frame_stats
             if self.profile is None:
                 self.launch_cpu(*arrays)
             else:

@@ -12,12 +12,11 @@ from mpmcli.scene.schema import SolverSettings
 from mpmcli.solver.contact.layers import Layers
 from mpmcli.solver.drive.forces import Drives
 from mpmcli.solver.grid.sparse_grid import wants_sparse
-from mpmcli.solver.machine.plan import members_of
-from mpmcli.solver.machine.room import in_steps, power_of_two, roomy_cells, roomy_colliders
+from mpmcli.solver.machine.plan import in_steps, members_of, padded_cells, padded_colliders, power_of_two
 from mpmcli.solver.particles.inflow import Inflow
 from mpmcli.solver.transfer.kept_motion import keeps_motion
 from mpmcli.solver.transfer.redistribution import fine_nodes
-from mpmcli.solver.transfer.volume_relaxation import needs_filling
+from mpmcli.solver.transfer.volume import needs_filling
 
 
 @dataclass(frozen=True)
@@ -91,14 +90,14 @@ class CompiledKind:
             members,
         )
 
-    def roomy(self) -> "CompiledKind":
+    def padded(self) -> "CompiledKind":
         """Return the kind with some room to spare, so that few sizes occur and compiled kernels are found again."""
         return replace(
             self,
-            cells=self.cells if self.sparse else roomy_cells(self.cells),
+            cells=self.cells if self.sparse else padded_cells(self.cells),
             particles=tuple(map(in_steps, self.particles)),
             bodies=tuple(map(power_of_two, self.bodies)),
-            colliders=roomy_colliders(self.colliders),
+            colliders=padded_colliders(self.colliders),
             inflow=replace(self.inflow, cells=power_of_two(self.inflow.cells) if self.inflow.cells else 0),
         )
 

@@ -1,7 +1,6 @@
 """Carries out steps on the CPU: a launch takes many steps of each run, and records frames, until its host is needed.
 
-The functions of a step take the grid, the walls and so on as objects; `views` returns copies of them for one run, whose
-numbers are variables of the kernel. A run has the same bytes in any batch and on any number of threads.
+A run has the same bytes in any batch and on any number of threads.
 """
 
 import time
@@ -9,53 +8,53 @@ from collections import Counter
 
 import numpy as np
 
+from mpmcli.boundaries.doubles import as_double
 from mpmcli.boundaries.loads import Loads
 from mpmcli.boundaries.rigid_bodies import RigidBodies
 from mpmcli.quick_taichi import ti
 from mpmcli.solver.contact.body_contact import BodyContact
-from mpmcli.solver.contact.obstacles import Obstacles
-from mpmcli.solver.engine.cpu_phases import CpuPhases, RunInts, RunReals, Shown
+from mpmcli.solver.contact.surfaces import Obstacles
+from mpmcli.solver.engine.cpu_phases import CpuPhases, FrameBuffer, RunInts, RunReals
 from mpmcli.solver.engine.cpu_threads import LOOKS_IN_VAIN, CpuThreads
-from mpmcli.solver.engine.device import Device, views
+from mpmcli.solver.engine.device import Device
 from mpmcli.solver.engine.emission import CpuEmission
-from mpmcli.solver.engine.run_numbers import ATTEND, CROWDED, GOING, LOST, MEASURE, NOTES, Layout
+from mpmcli.solver.engine.run_state import (
+    ATTEND,
+    CROWDED,
+    FRAME_NUMBERS,
+    GOING,
+    LOST,
+    MEASURE,
+    Layout,
+    RunState,
+)
 from mpmcli.solver.engine.step_size import StepSize
 from mpmcli.solver.frames.reader import SOUND, sum_entries, sum_range
 from mpmcli.solver.grid.grid import box_of
 from mpmcli.solver.particles.sort import CHUNK, find_places, scratch_offset, stay_rolled
 from mpmcli.solver.particles.state_bounds import NOTHING, deformation_rate, entries, widen_motion, widen_state
-from mpmcli.solver.transfer.redistribution import farthest_shift
 from mpmcli.solver.transfer.splines import PAD
 
-Notes = ti.types.ndarray(ti.f64, 3)
+FrameStats = ti.types.ndarray(ti.f64, 3)
 # What the profile calls the phases beside those of a step; a sort is any of its phases.
 BESIDE = {"forget": "sort", "mark": "sort", "average_shown": "frame", "show": "frame"}
 
 
 @ti.data_oriented
 class CpuLaunch:
-    """The kernels of a batch on the CPU, w being the number of a run; numbers, counts, shown and notes as of `Batch`.
+    """The kernels of a batch on the CPU, w being the number of a run; their arrays are those of `Batch`.
 
     phases: their bodies; steps: how a step is chosen; team: the threads that share a run.
     """
 
     def __init__(self, device: Device, layout: Layout) -> None:
         self.device, self.layout = device, layout
-        self.real, self.count = layout.real, layout.count
-        self.dimension, self.room = device.grid.dimension, tuple(device.room)
+        self.dimension, self.capacity = device.grid.dimension, tuple(device.capacity)
         self.members, self.stencils = tuple(enumerate(device.groups)), device.stencils
-        drifts = device.particles.touches or not all(group.total for group in device.groups)
-        shift = farthest_shift(device.grid.fine)
-        self.steps = StepSize(layout, device.groups, device.values, device.grid.scheme, drifts=drifts, shift=shift)
+        self.steps = StepSize.of(device, layout, device.values)
         self.phases = CpuPhases(device, layout)
         self.team = CpuThreads(self.phases, device.runs)
-        self.emission = CpuEmission(device, layout, device.stencils)
-        self.noted = tuple(
-            (k, getattr(layout.real, name)) for k, name in enumerate(NOTES) if hasattr(layout.real, name)
-        )
-        self.counted = tuple(
-            (k, getattr(layout.count, name)) for k, name in enumerate(NOTES) if hasattr(layout.count, name)
-        )
+        self.emission = CpuEmission(device, device.stencils)
         self.alone, self.collides = device.threads == 1, device.colliders is not None
         self.sum_count = sum_entries(self.dimension)
         self.next_run = ti.field(int, shape=())
@@ -63,7 +62,7 @@ class CpuLaunch:
         self.token: tuple[int, ...] = ()
 
     @ti.kernel
-    def launch(self, numbers: RunReals, counts: RunInts, shown: Shown, notes: Notes):
+    def launch(self, numbers: RunReals, counts: RunInts, frame_buffer: FrameBuffer, frame_stats: FrameStats):
         """Advance every run."""
         for number in ti.static(self.token):
             self.next_run[None] = number
@@ -77,11 +76,11 @@ class CpuLaunch:
                 w = ti.atomic_add(self.next_run[None], 1)
                 if ti.static(self.phases.shared):
                     # The first thread to come leads: a system may let threads run one after another.
-                    self.advance_run(0, w, numbers, counts, shown, notes)
+                    self.advance_run(0, w, numbers, counts, frame_buffer, frame_stats)
                 else:
                     # Threads take runs as they become free: no number depends on which one.
                     while w < self.device.runs:
-                        self.advance_run(w, 0, numbers, counts, shown, notes)
+                        self.advance_run(w, 0, numbers, counts, frame_buffer, frame_stats)
                         w = ti.atomic_add(self.next_run[None], 1)
 
     @ti.func
@@ -91,138 +90,124 @@ class CpuLaunch:
         t: int,
         numbers: ti.template(),
         counts: ti.template(),
-        shown: ti.template(),
-        notes: ti.template(),
+        frame_buffer: ti.template(),
+        frame_stats: ti.template(),
     ):
         """Advance a run, record frames, and measure it where the host needs that; threads but t = 0 only help."""
-        status = counts[w, self.count.status]
+        (run,) = ti.static((self.phases.state(w, numbers, counts),))
+        status = run.status
         self.team.enter(w)
         goes_on = True
         phase, idle = -1, 0
         if t == 0:
-            counts[w, self.count.frame_is_noted] = 0
+            run.frame_recorded = 0
         while goes_on:
             if t == 0 and self.team.finished(w):
-                phase = self.lead(w, phase, numbers, counts, notes)
+                phase = self.lead(run, phase, frame_stats)
                 if phase >= 0:
                     self.team.publish(w, phase)
                 else:
                     goes_on = False
             if goes_on:
-                found = self.team.help(w, t, idle, numbers, counts, shown)
+                found = self.team.help(w, t, idle, numbers, counts, frame_buffer)
                 idle = 0 if found == 1 else idle + 1
                 if found < 0 or (idle > LOOKS_IN_VAIN and t > 0):
                     goes_on = False
         self.team.leave(w)
         if t == 0:
             self.team.close(w)
-            if status == MEASURE or (status == GOING and counts[w, self.count.status] == ATTEND):
-                counts[w, self.count.status] = ATTEND
-                self.measure(w, numbers, counts)
+            if status == MEASURE or (status == GOING and run.status == ATTEND):
+                run.status = ATTEND
+                self.measure(run)
 
     @ti.func
-    def lead(self, w: int, done: int, numbers: ti.template(), counts: ti.template(), notes: ti.template()):
+    def lead(self, run: ti.template(), done: int, frame_stats: ti.template()):
         """Do what follows on a phase that is done, -1 at the start of a launch; return the next one, -1 for none."""
         phase = done
-        if phase == self.phases.last_of_step:
-            dt = numbers[w, self.real.step]
-            speed = self.phases.end_step(w, dt, numbers)
-            splits, deformation = numbers[w, self.real.splits], numbers[w, self.real.deformation]
-            self.steps.end(w, dt, splits, counts[w, self.count.step_limit], deformation, speed, numbers, counts)
-            counts[w, self.count.frame_is_noted] = 0
+        if phase < 0:
+            self.phases.begin_launch(run)
+        elif phase == self.phases.last_of_step:
+            self.steps.end(run, self.phases.end_step(run))
+            run.frame_recorded = 0
         elif phase == self.phases.last_of_sort:
-            self.end_sort(w, numbers, counts)
+            self.end_sort(run)
         elif phase == self.phases.showing:
-            self.record(w, numbers, counts, notes)
-            counts[w, self.count.frame_is_noted] = 1
+            self.record(run, frame_stats)
+            run.frame_recorded = 1
         elif phase >= self.phases.sorts:
-            self.sort_on(w, phase, numbers, counts)
-        inside = phase >= 0 and phase != self.phases.showing and counts[w, self.count.status] != CROWDED
+            self.sort_on(run, phase)
+        inside = phase >= 0 and phase != self.phases.showing and run.status != CROWDED
         if inside and phase != self.phases.last_of_step and phase != self.phases.last_of_sort:
             phase += 1
         else:
             phase = -1
-            arrived, going = counts[w, self.count.arrived] == 1, counts[w, self.count.status] == GOING
-            noted = counts[w, self.count.frame_is_noted] == 1
-            if arrived and counts[w, self.count.records] == 1 and counts[w, self.count.status] != LOST and not noted:
+            arrived = run.arrived == 1
+            if arrived and run.records == 1 and run.status != LOST and run.frame_recorded == 0:
                 phase = self.phases.before_showing
-            elif going and not arrived and counts[w, self.count.budget] > 0:
+            elif run.status == GOING and not arrived and run.budget > 0:
                 if ti.static(self.emission.needed):
-                    self.enter(w, numbers, counts)
-                drift = numbers[w, self.real.drift] + self.steps.shift_ahead(w, counts)
-                if drift >= numbers[w, self.real.drift_allowed]:
+                    self.enter(run)
+                if run.drift + self.steps.shift_ahead(run) >= as_double(self.device.drift_allowed):
                     phase = self.phases.sorts
-                elif self.begin_step(w, numbers, counts):
-                    phase = self.phases.first_of_step(w)
+                elif self.steps.begin(run):
+                    self.begin_step(run)
+                    phase = self.phases.first_of_step(run)
         return phase
 
     @ti.func
-    def begin_step(self, w: int, numbers: ti.template(), counts: ti.template()):
-        """Choose the next step; return whether it can be taken."""
-        dt, kick, splits, limit, deformation, _stable = self.steps.begin(w, numbers, counts)
-        numbers[w, self.real.step], numbers[w, self.real.splits] = dt, splits
-        numbers[w, self.real.deformation] = deformation
-        counts[w, self.count.step_limit] = limit
-        if dt > 0:
-            relaxed = self.steps.relaxed_in(w, dt, numbers, counts)
-            self.find_box(w, numbers, counts)
-            self.phases.begin_step(w, dt, kick, relaxed, numbers)
-            if ti.static(self.phases.separates):
-                self.find_meetings(w, numbers, counts)
-        return dt > 0
+    def begin_step(self, run: ti.template()):
+        """Prepare the step that was chosen."""
+        self.find_box(run)
+        self.phases.begin_step(run)
+        if ti.static(self.phases.separates):
+            self.find_meetings(run)
 
     @ti.func
-    def measure(self, w: int, numbers: ti.template(), counts: ti.template()):
+    def measure(self, run: ti.template()):
         """Store the maxima of each group."""
         for g, group in ti.static(self.members):
             own = ti.Vector([NOTHING] * ti.static(entries(group)))
-            first = w * ti.static(self.room[g])
-            for p in range(first, first + counts[w, self.count.particles[g]]):
+            first = run.w * ti.static(self.capacity[g])
+            for p in range(first, first + run.particles[g]):
                 stay_rolled(self.device.orders[g].buffers.real, p)
                 v, C = group.motion(p)
                 widen_motion(own, v, deformation_rate(group, C))
                 widen_state(group, own, p)
             for k in ti.static(range(entries(group))):
-                numbers[w, self.real.maxima[g] + k] = ti.cast(own[k], ti.f64)
+                run.maxima[g][k] = ti.cast(own[k], ti.f64)
 
     # Sorts.
 
     @ti.func
-    def sort_on(self, w: int, phase: int, numbers: ti.template(), counts: ti.template()):
+    def sort_on(self, run: ti.template(), phase: int):
         """Do what follows on a phase of a sort before the next one."""
-        h, inverse, scale, box, last, extent = self.phases.view_numbers(w, numbers, counts)
-        grid, _nodes, _particles, orders, _groups = ti.static(
-            views(self.device, w, h, inverse, scale, box, last, extent)
-        )
-        if ti.static(grid.sparse):
+        (view,) = ti.static(self.phases.see(run))
+        if ti.static(view.grid.sparse):
             if phase == self.phases.marking:
-                if not grid.number():
-                    counts[w, self.count.status] = CROWDED
+                if not view.grid.number():
+                    run.status = CROWDED
         for g in ti.static(range(len(self.members))):
             if phase == ti.static(self.phases.sorts_of[g]):
-                find_places(orders[g], w, w * ti.static(self.room[g]))
+                find_places(view.orders[g], run.w, run.w * ti.static(self.capacity[g]))
 
     @ti.func
-    def end_sort(self, w: int, numbers: ti.template(), counts: ti.template()):
+    def end_sort(self, run: ti.template()):
         """Find the range of the stencils of particles that were sorted."""
         low = ti.Vector([2**30] * self.dimension)
         high = ti.Vector([-1] * self.dimension)
-        self.emission.count_active(w, counts)
+        self.emission.count_active(run)
         if ti.static(self.phases.separates):
-            self.device.contact.surfaces.forget(w)
-        h, inverse, scale, box, last, extent = self.phases.view_numbers(w, numbers, counts)
-        _grid, _nodes, _particles, orders, groups = ti.static(
-            views(self.device, w, h, inverse, scale, box, last, extent)
-        )
-        if ti.static(self.device.particles.touches):
-            self.device.particles.contact.fill(w, w * self.room[0], counts[w, self.count.particles[0]], h)
+            self.device.contact.surfaces.forget(run.w)
+        (view,) = ti.static(self.phases.see(run))
+        if ti.static(self.device.particles.has_contact):
+            self.device.particles.contact.fill(run.w, run.w * self.capacity[0], run.particles[0], view.grid.spacing)
         for g in ti.static(range(len(self.members))):
-            first, own = w * ti.static(self.room[g]), counts[w, self.count.particles[g]]
+            first, own = run.w * ti.static(self.capacity[g]), run.particles[g]
             for p in range(first, first + own):
-                base = orders[g].first_node_of(p)
+                base = view.orders[g].first_node_of(p)
                 low, high = ti.min(low, base), ti.max(high, base)
                 if ti.static(self.phases.separates):
-                    layer = w * ti.static(self.device.grid.layers) + groups[g].layer_of(p)
+                    layer = run.w * ti.static(self.device.grid.layers) + view.groups[g].layer_of(p)
                     self.device.contact.surfaces.widen(layer, base)
             if ti.static(self.phases.shared):
                 self.phases.places.divide(g, own)
@@ -232,47 +217,40 @@ class CpuLaunch:
                 for a in ti.static(range(self.dimension)):
                     low[a], high[a] = PAD, PAD
         for a in ti.static(range(self.dimension)):
-            self.stencils[w * 2, a], self.stencils[w * 2 + 1, a] = low[a], high[a]
-        numbers[w, self.real.drift] = 0.0
+            self.stencils[run.w * 2, a], self.stencils[run.w * 2 + 1, a] = low[a], high[a]
+        run.drift = 0.0
 
     @ti.func
-    def find_box(self, w: int, numbers: ti.template(), counts: ti.template()):
+    def find_box(self, run: ti.template()):
         """Find the nodes that the next step uses."""
-        drift = ti.cast(ti.ceil(numbers[w, self.real.drift]), int)
+        drift = ti.cast(ti.ceil(run.drift), int)
         for a in ti.static(range(self.dimension)):
-            last_wall = PAD + counts[w, self.count.cells[a]]
-            low, high = self.stencils[w * 2, a], self.stencils[w * 2 + 1, a]
-            first, last = box_of(self.device.grid, a, low, high, drift, last_wall)
-            self.device.grid.box[w * 2, a] = first
-            self.device.grid.box[w * 2 + 1, a] = last - first + 1
+            low, high = self.stencils[run.w * 2, a], self.stencils[run.w * 2 + 1, a]
+            first, last = box_of(self.device.grid, a, low, high, drift, PAD + run.cells[a])
+            self.device.grid.box[run.w * 2, a] = first
+            self.device.grid.box[run.w * 2 + 1, a] = last - first + 1
         if ti.static(self.phases.shared and not self.device.grid.sparse):
             self.phases.places.divide_rows()
 
     @ti.func
-    def find_meetings(self, w: int, numbers: ti.template(), counts: ti.template()):
+    def find_meetings(self, run: ti.template()):
         """Find where bodies may meet in the step, with colliders where they are in it."""
-        drift = ti.cast(ti.ceil(numbers[w, self.real.drift]), int)
-        h, inverse, scale, box, last, extent = self.phases.view_numbers(w, numbers, counts)
-        _grid, nodes, _particles, _orders, _groups = ti.static(
-            views(self.device, w, h, inverse, scale, box, last, extent)
-        )
-        (obstacles,) = ti.static((Obstacles(nodes.images.walls, nodes.colliders, h),))
-        self.device.contact.surfaces.find_box(self.device.grid, obstacles, w, drift, last)
+        drift = ti.cast(ti.ceil(run.drift), int)
+        (view,) = ti.static(self.phases.see(run))
+        (obstacles,) = ti.static((Obstacles(view.nodes.images.walls, view.nodes.colliders, view.grid.spacing),))
+        self.device.contact.surfaces.find_box(self.device.grid, obstacles, run.w, drift, view.particles.last)
 
     @ti.func
-    def enter(self, w: int, numbers: ti.template(), counts: ti.template()):
+    def enter(self, run: ti.template()):
         """Let the sheets of emitters enter that are due."""
-        if numbers[w, self.real.due] <= numbers[w, self.real.time]:
-            h, inverse, scale, box, last, extent = self.phases.view_numbers(w, numbers, counts)
-            _grid, _nodes, _particles, orders, _all = ti.static(
-                views(self.device, w, h, inverse, scale, box, last, extent)
-            )
-            before = numbers[w, self.real.due]
-            self.emission.enter(orders, w, numbers, counts)
+        if run.due <= run.time:
+            (view,) = ti.static(self.phases.see(run))
+            before = run.due
+            self.emission.enter(view.orders, run)
             if ti.static(self.device.grid.sparse):
                 # What has come in may reach tiles without a number.
-                if numbers[w, self.real.due] != before:
-                    numbers[w, self.real.drift] = numbers[w, self.real.drift_allowed]
+                if run.due != before:
+                    run.drift = as_double(self.device.drift_allowed)
 
     @ti.kernel
     def share_work(self, counts: RunInts):
@@ -281,80 +259,88 @@ class CpuLaunch:
         for w in range(self.device.runs):
             if ti.static(self.phases.shared):
                 for g in ti.static(range(len(self.members))):
-                    self.phases.places.divide(g, counts[w, self.count.particles[g]])
+                    self.phases.places.divide(g, counts[w, ti.static(self.layout.counts["particles"][g])])
 
     # Frames.
 
     def takers(self) -> list[tuple[Loads | RigidBodies | BodyContact, int]]:
-        """Return what notes on a frame have behind the sums of each group, and from which column on."""
-        device, column = self.device, len(NOTES) + len(self.members) * self.sum_count
+        """Return what the statistics of a frame have behind the sums of each group, and from which column on."""
+        device, column = self.device, len(FRAME_NUMBERS) + len(self.members) * self.sum_count
         found = []
         if device.colliders is not None:
             found.append((device.colliders.loads, column))
-            column += device.colliders.loads.room * device.colliders.loads.width
+            column += device.colliders.loads.capacity * device.colliders.loads.width
         # Those that separate and those that move freely are not in one scene.
         return found + [(each, column) for each in (device.rigid, device.contact) if each is not None]
 
     @ti.func
-    def record(self, w: int, numbers: ti.template(), counts: ti.template(), notes: ti.template()):
-        """Note what belongs to a frame that is shown, and aim at the next one if there is one."""
-        frame = counts[w, self.count.recorded]
+    def record(self, run: ti.template(), frame_stats: ti.template()):
+        """Store the statistics of a frame that is shown, and aim at the next one if there is one."""
+        frame = run.recorded
         sound = True
         for g, group in ti.static(self.members):
-            scratch, seen = ti.static((self.device.orders[g].buffers, group.seen_from(w)))
-            offset = scratch_offset(scratch, g, w, ti.static(self.room[g]))
-            first = w * ti.static(self.room[g])
-            sums = sum_range(seen, first, counts[w, self.count.particles[g]], scratch.real, offset)
+            scratch, seen = ti.static((self.device.orders[g].buffers, group.seen_from(run.w)))
+            offset = scratch_offset(scratch, g, run.w, ti.static(self.capacity[g]))
+            sums = sum_range(seen, run.w * ti.static(self.capacity[g]), run.particles[g], scratch.real, offset)
             for k in ti.static(range(self.sum_count)):
-                notes[w, frame, ti.static(len(NOTES) + g * self.sum_count) + k] = sums[k]
+                frame_stats[run.w, frame, ti.static(len(FRAME_NUMBERS) + g * self.sum_count) + k] = sums[k]
             if sums[ti.static(SOUND)] == 0:
                 sound = False
         for takers, column in ti.static(self.takers()):
-            takers.sum_up(w, frame, column, notes)
-        for k, column in ti.static(self.noted):
-            notes[w, frame, k] = numbers[w, column]
-        for k, column in ti.static(self.counted):
-            notes[w, frame, k] = ti.cast(counts[w, column], ti.f64)
+            takers.sum_up(run.w, frame, column, frame_stats)
+        for k, value in ti.static(enumerate(self.noted(run))):
+            frame_stats[run.w, frame, k] = ti.cast(value, ti.f64)
         if sound:
-            counts[w, self.count.recorded] = frame + 1
+            run.recorded = frame + 1
             for g in ti.static(range(len(self.members))):
-                counts[w, self.count.row] += counts[w, self.count.capacity[g]]
-            if counts[w, self.count.frame] < counts[w, self.count.frames]:
-                counts[w, self.count.frame] += 1
-                self.steps.aim(w, numbers, counts)
-                if frame + 1 == counts[w, self.count.room] and counts[w, self.count.status] == GOING:
-                    counts[w, self.count.status] = ATTEND
+                run.row += run.capacity[g]
+            if run.frame < run.frames:
+                run.frame += 1
+                self.steps.next_frame(run)
+                if frame + 1 == run.frame_capacity and run.status == GOING:
+                    run.status = ATTEND
             else:
-                counts[w, self.count.status] = ATTEND
+                run.status = ATTEND
         else:
-            counts[w, self.count.status] = LOST
+            run.status = LOST
+
+    def noted(self, run: RunState) -> list[object]:
+        """Return the numbers of a run that a frame takes."""
+        return [getattr(run, name) for name in FRAME_NUMBERS]
 
     # The profile: the same phases, a launch for each.
 
     def launch_by_phase(
-        self, numbers: np.ndarray, counts: np.ndarray, shown: np.ndarray, notes: np.ndarray, seconds: Counter
+        self,
+        numbers: np.ndarray,
+        counts: np.ndarray,
+        frame_buffer: np.ndarray,
+        frame_stats: np.ndarray,
+        seconds: Counter,
     ) -> None:
         """Advance the only run as `launch` does; add the wall time of each phase to `seconds` by its name."""
-        status, phase = counts[0, self.count.status], -1
-        counts[0, self.count.frame_is_noted] = 0
-        while (phase := self.next_phase(phase, numbers, counts, notes)) >= 0:
+        run, phase = self.phases.state(0, numbers, counts), -1
+        status = run.status
+        run.frame_recorded = 0
+        while (phase := self.next_phase(phase, numbers, counts, frame_stats)) >= 0:
             began = time.perf_counter()
-            self.work(phase, numbers, counts, shown)
+            self.work(phase, numbers, counts, frame_buffer)
             names = [kind.name for kind in self.phases.kinds if kind.first <= phase < kind.after]
             seconds[BESIDE.get(names[0], names[0])] += time.perf_counter() - began
         began = time.perf_counter()
-        if status == MEASURE or (status == GOING and counts[0, self.count.status] == ATTEND):
-            counts[0, self.count.status] = ATTEND
+        if status == MEASURE or (status == GOING and run.status == ATTEND):
+            run.status = ATTEND
             self.measure_run(numbers, counts)
         seconds["measure"] += time.perf_counter() - began
 
     @ti.kernel
-    def next_phase(self, phase: int, numbers: RunReals, counts: RunInts, notes: Notes) -> int:
+    def next_phase(self, phase: int, numbers: RunReals, counts: RunInts, frame_stats: FrameStats) -> int:
         """Do what follows on a phase of the only run; return the next one."""
-        return self.lead(0, phase, numbers, counts, notes)
+        (run,) = ti.static((self.phases.state(0, numbers, counts),))
+        return self.lead(run, phase, frame_stats)
 
     @ti.kernel
-    def work(self, phase: int, numbers: RunReals, counts: RunInts, shown: Shown):
+    def work(self, phase: int, numbers: RunReals, counts: RunInts, frame_buffer: FrameBuffer):
         """Do all parts of a phase of the only run."""
         ti.loop_config(serialize=True)
         for _ in range(1):
@@ -365,7 +351,7 @@ class CpuLaunch:
             if q % CHUNK == 0:
                 self.team.enter(0)
                 while not self.team.finished(0):
-                    _found = self.team.help(0, q // CHUNK, 0, numbers, counts, shown)
+                    _found = self.team.help(0, q // CHUNK, 0, numbers, counts, frame_buffer)
                 self.team.leave(0)
 
     @ti.kernel
@@ -373,4 +359,5 @@ class CpuLaunch:
         """Store the maxima of each group of the only run."""
         ti.loop_config(serialize=True)
         for _ in range(1):
-            self.measure(0, numbers, counts)
+            (run,) = ti.static((self.phases.state(0, numbers, counts),))
+            self.measure(run)

@@ -7,14 +7,16 @@ own for Taichi as well (`ti.real_func`). Such a function knows nothing of its ca
 asks for the numbers of the run anew.
 """
 
+from collections.abc import Callable
+from copy import copy
+from typing import NamedTuple
+
 from mpmcli.boundaries.mirror_images import find_friction
 from mpmcli.quick_taichi import ti
-from mpmcli.solver.engine.cpu_contact import CpuContact
-from mpmcli.solver.engine.cpu_parts import KICK, MOVED, RELAXED, SPEED, VECTORS, Part, PartKind
-from mpmcli.solver.engine.cpu_regions import CpuRegions
-from mpmcli.solver.engine.device import Device, views
-from mpmcli.solver.engine.phases import Phase, sorted_fields
-from mpmcli.solver.engine.run_numbers import Layout
+from mpmcli.solver.contact.surfaces import Obstacles
+from mpmcli.solver.engine.device import Device, RunPhases, RunView
+from mpmcli.solver.engine.run_state import Layout
+from mpmcli.solver.engine.step import Phase, sorted_fields
 from mpmcli.solver.frames.reader import show_range
 from mpmcli.solver.grid.grid import clear_blocks, clear_rows
 from mpmcli.solver.grid.sparse_grid import BLOCKS, PENCILS
@@ -24,25 +26,177 @@ from mpmcli.solver.transfer.cpu_transfers import (
     advance_range,
     advance_tiles,
     average_pencils,
+    nodes_of_blocks,
+    nodes_of_rows,
     scatter_pencils,
     scatter_range,
     update_blocks,
     update_rows,
 )
-from mpmcli.solver.transfer.particle_update import NOT_LOST
-from mpmcli.solver.transfer.splines import PAD
-from mpmcli.solver.transfer.volume_average import average_for_frame, average_range
+from mpmcli.solver.transfer.volume import average_for_frame, average_range
 
 # Of all runs: numbers, counts and what particles show, see `Batch`.
 RunReals = ti.types.ndarray(ti.f64, 2)
 RunInts = ti.types.ndarray(ti.i32, 2)
-Shown = ti.types.ndarray(ndim=2)
+FrameBuffer = ti.types.ndarray(ndim=2)
 # Parts of a loop over the particles or the nodes of a region; on a sparse grid, where parts are whole pencils.
 SHARES, SPARSE_SHARES = 4, 16
 
 
+class PartKind(NamedTuple):
+    """The parts of some phases that have one body.
+
+    name: of the phases; group: number of the group of particles. first, after: number of the first phase, and the
+    one after the last. body: name of the method. item: what that does for each node or particle, where it says nothing.
+    """
+
+    name: str
+    group: int
+    first: int
+    after: int
+    body: str
+    item: Callable | None
+
+
+class Part:
+    """A part that a thread does, with the view that its run has of the device.
+
+    Attributes:
+        run, step, grid, nodes, particles, order, group: see `RunView`; the last two are those of a group of particles.
+        item: what is done for each node or particle; atomic: whether sums need atomics, False.
+        g: number of the group; w: of the run; turn: of the phase among those of its kind.
+        region, part: of the part; t: of the thread; frame_buffer: see `Batch`.
+    """
+
+    atomic = False
+
+    def __init__(self, view: RunView, kind: PartKind, *variables: object) -> None:
+        """Keep a view, and variables of a kernel."""
+        g, self.item = kind.group, kind.item
+        self.run, self.step, self.w = view.run, view.step, view.w
+        self.grid, self.nodes, self.particles = view.grid, view.nodes, view.particles
+        self.g, self.group, self.order = g, view.groups[g], view.orders[g]
+        self.turn, self.region, self.part, self.t, self.frame_buffer = variables
+
+    def in_layer(self, layer: object, own: object) -> "Part":
+        """Return the part for a layer of nodes, by its number and what it has in use, variables of a kernel."""
+        if self.grid.layers == 1:
+            return self
+        view = copy(self)
+        view.grid = self.grid.in_layer(layer, own)
+        view.nodes = self.nodes.in_layer(view.grid, layer)
+        return view
+
+
 @ti.data_oriented
-class CpuPhases(CpuContact):
+class CpuRegions:
+    """The regions of the only run; where there are more runs, each is one region.
+
+    regions: their number.
+    """
+
+    def __init__(self, device: Device, regions: int) -> None:
+        self.device, self.regions, self.dimension = device, regions, device.grid.dimension
+        self.groups = tuple(range(len(device.groups)))
+        # Of each region but the last: the first pencil after it, per group, and the first row of nodes after it.
+        self.pencils = tuple(ti.field(int, shape=max(regions - 1, 1)) for _ in device.groups)
+        self.rows = ti.field(int, shape=max(regions - 1, 1))
+
+    @ti.func
+    def even_part(self, count: int, region: int):
+        """Return the part of a region in a range of `count`, as its first and the first after it."""
+        return share_start(count, region, self.regions), share_start(count, region + 1, self.regions)
+
+    @ti.func
+    def rows_of(self, grid: ti.template(), region: int):
+        """Return the first row of nodes of a region, and the first after it."""
+        first, after = 0, grid.row_count()
+        if ti.static(grid.sparse):
+            first, after = self.even_part(after, region)
+        elif ti.static(self.regions > 1):
+            if region > 0:
+                first = self.rows[region - 1]
+            if region < self.regions - 1:
+                after = self.rows[region]
+        return first, after
+
+    @ti.func
+    def particles_of(self, g: ti.template(), w: int, region: int, count: int):
+        """Return the first particle of a region of run w, and the first after it, of `count` of the g-th group."""
+        first = w * ti.static(self.device.capacity[g])
+        after = first + count
+        if ti.static(self.regions > 1):
+            if region > 0:
+                first = self.device.orders[g].first_particle_of(self.pencils[g][region - 1])
+            if region < self.regions - 1:
+                after = self.device.orders[g].first_particle_of(self.pencils[g][region])
+        return first, after
+
+    @ti.func
+    def pencils_of(self, g: ti.template(), region: int):
+        """Return the first pencil of a region for the g-th group, and the first after it."""
+        first, after = 0, self.device.orders[g].pencils()
+        if ti.static(self.regions > 1):
+            if region > 0:
+                first = self.pencils[g][region - 1]
+            if region < self.regions - 1:
+                after = self.pencils[g][region]
+        return first, after
+
+    @ti.func
+    def divide(self, g: ti.template(), count: int):
+        """Divide the `count` particles of a group, which were sorted, with about as many in each region."""
+        pencils = self.device.orders[g].pencils()
+        region = 0
+        for r in range(pencils):
+            before = self.device.orders[g].first_particle_of(r)
+            size = self.device.orders[g].first_particle_of(r + 1) - before
+            # The border falls where more than half of the pencil lies beyond the share.
+            while region < self.regions - 1 and before + size // 2 >= share_start(count, region + 1, self.regions):
+                self.pencils[g][region] = r
+                region += 1
+        while region < self.regions - 1:
+            self.pencils[g][region] = pencils
+            region += 1
+        for colour in range(ti.static(self.device.orders[g].colours)):
+            self.device.orders[g].work[colour, 0] = 0
+            self.device.orders[g].work[colour, self.regions] = self.device.orders[g].pencil_count(colour)
+            region = 0
+            for q in range(self.device.orders[g].pencil_count(colour)):
+                pencil = self.device.orders[g].pencil_of(colour, q)
+                while region < self.regions - 1 and pencil >= self.pencils[g][region]:
+                    self.device.orders[g].work[colour, region + 1] = q
+                    region += 1
+            while region < self.regions - 1:
+                self.device.orders[g].work[colour, region + 1] = self.device.orders[g].pencil_count(colour)
+                region += 1
+
+    @ti.func
+    def divide_rows(self):
+        """Divide the nodes in use as the particles of the first group are."""
+        d = ti.static(self.dimension)
+        rows, least = 1, 0
+        for a in ti.static(range(d - 1)):
+            rows *= self.device.grid.box[1, a]
+        for region in range(self.regions - 1):
+            rest, row, width = self.pencils[0][region], 0, 1
+            for b in ti.static(range(d - 1)):
+                a = ti.static(d - 2 - b)
+                extent = self.device.grid.box[1, a]
+                tile = rest % ti.static(self.device.grid.tiles[a])
+                node = tile * ti.static(self.device.grid.tile) - self.device.grid.box[0, a]
+                row += width * ti.min(ti.max(node, 0), extent - 1)
+                width *= extent
+                rest = rest // ti.static(self.device.grid.tiles[a])
+            # Behind the last tile along the first axis.
+            if rest > 0:
+                row = rows
+            least = ti.max(least, ti.min(row, rows))
+            self.rows[region] = least
+
+
+@ti.data_oriented
+class CpuPhases(RunPhases):
     """The phases of the runs of a batch, w being the number of a run, region and part those of a part.
 
     A step begins with `first_of_step`, a sort with `sorts`, the end of what comes before a frame is `showing`.
@@ -54,20 +208,14 @@ class CpuPhases(CpuContact):
         clears: number of the first phase of steps that shift no particles.
         last_of_step, sorts, marking, last_of_sort, before_showing, showing: numbers of phases.
         coloured: (group, first phase) of the phases that go over the pencils of a group, of which there are `passes`.
-        values: numbers of the step of each run.
     """
 
     def __init__(self, device: Device, layout: Layout) -> None:
-        self.device, self.dimension = device, device.grid.dimension
-        self.members = tuple(enumerate(device.groups))
-        self.real, self.count = layout.real, layout.count
+        super().__init__(device, layout)
         self.shares = SPARSE_SHARES if device.grid.sparse else SHARES
         self.shared = device.runs == 1 and device.threads > 1
         self.regions = device.threads if self.shared else 1
         self.places = CpuRegions(device, self.regions)
-        # Behind VECTORS gravity's change of velocity, and per group the largest rate and change by relaxation.
-        self.rates = VECTORS + self.dimension
-        self.values = ti.field(float, shape=(device.runs, self.rates + 2 * len(device.groups)))
         self.colours = device.orders[0].colours
         self.moves, self.separates = device.motion is not None, device.contact is not None
         self.rigid = device.rigid is not None
@@ -100,7 +248,7 @@ class CpuPhases(CpuContact):
         self.last_of_sort, self.before_showing = end - 1, end
         # Before a frame is shown volumes are averaged once more.
         for g, group in self.members:
-            if group.averaged:
+            if group.uses_f_bar:
                 end = self._add("average_shown", g, self.before_showing, 1)
         self.showing = end
         for g, _ in self.members:
@@ -111,6 +259,7 @@ class CpuPhases(CpuContact):
         item, body = phase and (phase.ranged or phase.body), name
         if item:
             body = "each_node" if phase.over == "nodes" else "each_in_pencils" if phase.adds else "each_particle"
+            body = "shift_nodes" if body == "each_node" and phase.shifts else body
         self.kinds += (PartKind(name, group, first, first + length, body, item),)
         return first + length
 
@@ -121,67 +270,47 @@ class CpuPhases(CpuContact):
     # A step as a whole, on the thread that leads.
 
     @ti.func
-    def view_numbers(self, w: int, numbers: ti.template(), counts: ti.template()):
-        """Return what `views` takes of a run: spacing, its inverse, the gradient's scale, box, last node, extent."""
-        d = ti.static(self.dimension)
-        last = ti.Vector.zero(int, d)
-        extent = ti.Vector.zero(float, d)
-        box = ti.Matrix.zero(int, 2, d)
-        for a in ti.static(range(d)):
-            last[a] = PAD + counts[w, self.count.cells[a]]
-            extent[a] = ti.cast(numbers[w, self.real.extent[a]], float)
-            for i in ti.static(range(2)):
-                box[i, a] = self.device.grid.box[w * 2 + i, a]
-        h = ti.cast(numbers[w, self.real.spacing], float)
-        inverse = ti.cast(numbers[w, self.real.inverse_spacing], float)
-        scale = ti.cast(numbers[w, self.real.gradient_scale], float)
-        return h, inverse, scale, box, last, extent
+    def begin_launch(self, run: ti.template()):
+        """Store the numbers of a run that its steps need in the precision of particles."""
+        (step,) = ti.static((self.step_of(run.w),))
+        step.spacing = ti.cast(run.spacing, float)
+        step.inverse_spacing = ti.cast(run.inverse_spacing, float)
+        step.gradient_scale = ti.cast(run.gradient_scale, float)
+        for a in ti.static(range(self.dimension)):
+            step.extent[a] = ti.cast(run.extent[a], float)
 
     @ti.func
-    def begin_step(self, w: int, dt: ti.f64, kick: ti.f64, relaxed: ti.f64, numbers: ti.template()):
+    def begin_step(self, run: ti.template()):
         """Store the numbers of a step."""
-        self.values[w, MOVED] = ti.cast(dt, float)
-        self.values[w, KICK] = ti.cast(kick, float)
-        self.values[w, RELAXED] = ti.cast(relaxed, float)
-        self.values[w, SPEED] = 0.0
+        (step,) = ti.static((self.step_of(run.w),))
+        step.dt = ti.cast(run.dt, float)
+        step.kick = ti.cast(run.kick, float)
+        step.relaxed = ti.cast(run.relaxed, float)
+        step.speed_squared = 0.0
         if ti.static(self.device.values.gravity_varies):
-            pulled = self.device.gravity.in_step(self.values[w, KICK], w)
+            pulled = self.device.gravity.in_step(step.kick, run.w)
             for a in ti.static(range(self.dimension)):
-                self.values[w, VECTORS + a] = pulled[a]
+                step.gravity[a] = pulled[a]
         else:
             for a in ti.static(range(self.dimension)):
-                pull = ti.cast(numbers[w, self.real.gravity[a]], float)
-                self.values[w, VECTORS + a] = self.values[w, KICK] * pull
+                step.gravity[a] = step.kick * ti.cast(run.gravity[a], float)
         if ti.static(self.moves):
-            start = numbers[w, self.real.time]
-            self.device.values.set_motions(w, self.device.motion, start, start + dt)
-            self.device.motion.advance(w, dt)
+            self.device.values.set_motions(run.w, self.device.motion, run.time, run.time + run.dt)
+            self.device.motion.advance(run.w, run.dt)
         if ti.static(self.rigid):
-            self.device.rigid.begin(w, dt, self.values[w, KICK], self.gravity_step(w))
+            self.device.rigid.begin(run.w, run.dt, step.kick, self.gravity_of(step))
         for g in ti.static(range(len(self.members))):
             # A law may have no particle yet.
-            self.values[w, self.rates + 2 * g] = 0.0 if ti.static(self.device.comes_and_goes) else NOTHING
-            self.values[w, self.rates + 2 * g + 1] = 0.0
+            step.rate[g] = 0.0 if ti.static(self.device.comes_and_goes) else NOTHING
+            step.volume_change[g] = 0.0
 
     @ti.func
-    def first_of_step(self, w: int):
+    def first_of_step(self, run: ti.template()):
         """Return the first phase of the step: only where it relaxes volumes are particles shifted before all else."""
         phase = 0
-        if self.values[w, RELAXED] == 0.0:
+        if run.relaxed == 0.0:
             phase += ti.static(self.clears)
         return phase
-
-    @ti.func
-    def end_step(self, w: int, dt: ti.f64, numbers: ti.template()):
-        """Store the rates of a step; return the largest speed of a node, m/s, -1 where a particle was lost."""
-        speed = ti.sqrt(self.values[w, SPEED])
-        for g in ti.static(range(len(self.members))):
-            # What the relaxation adds to the rate of deformation.
-            added = ti.cast(self.values[w, self.rates + 2 * g + 1], ti.f64) / dt
-            numbers[w, self.real.rate[g]] = added + ti.cast(self.values[w, self.rates + 2 * g], ti.f64)
-            if self.device.particles.lost[w * ti.static(len(self.members)) + g] != NOT_LOST:
-                speed = -1.0
-        return ti.cast(speed, ti.f64)
 
     # Parts.
 
@@ -216,7 +345,7 @@ class CpuPhases(CpuContact):
         t: int,
         numbers: RunReals,
         counts: RunInts,
-        shown: Shown,
+        frame_buffer: FrameBuffer,
     ):
         """Do a part of a phase in a region as thread t, if it belongs to the k-th of the `kinds` or to a later one.
 
@@ -224,26 +353,41 @@ class CpuPhases(CpuContact):
         the order of their addresses, so that the next process would find nothing.
         """
         if phase >= ti.static(self.kinds[k].first) and phase < ti.static(self.kinds[k].after):
-            h, inverse, scale, box, last, extent = self.view_numbers(w, numbers, counts)
-            run = ti.static(views(self.device, w, h, inverse, scale, box, last, extent))
+            (run,) = ti.static((self.state(w, numbers, counts),))
+            (view,) = ti.static(self.see(run))
             turn = phase - ti.static(self.kinds[k].first)
-            (at,) = ti.static((Part(run, self.kinds[k], w, turn, region, part, t, numbers, counts, shown),))
+            (at,) = ti.static((Part(view, self.kinds[k], turn, region, part, t, frame_buffer),))
             ti.static(self.body(self.kinds[k]))(at)
         if ti.static(k + 1 < len(self.kinds)):
-            self.do(ti.static(k + 1), w, phase, region, part, t, numbers, counts, shown)
+            self.do(ti.static(k + 1), w, phase, region, part, t, numbers, counts, frame_buffer)
 
     # Parts of phases that say what they do for each node or particle.
 
     @ti.func
     def each_node(self, at: ti.template()):
-        """Go through nodes."""
+        """Go through the nodes in use, of all layers."""
+        if ti.static(at.grid.sparse):
+            first, after = self.places.even_part(at.grid.sizes[PENCILS], at.region)
+            first, after = self.share(first, after, at.part)
+            nodes_of_blocks(at, at.grid.pencils[first], at.grid.pencils[after], at.step.kick)
+        else:
+            first, after = self.places.rows_of(at.grid, at.region)
+            first, after = self.share(first, after, at.part)
+            for layer in range(self.layer_count(at)):
+                own = self.used_by(at, layer)
+                (inner,) = ti.static((at.in_layer(layer, own),))
+                nodes_of_rows(inner, first, after, inner.step.kick)
+
+    @ti.func
+    def shift_nodes(self, at: ti.template()):
+        """Go through nodes in a shift, where the fine grid says what is in use."""
         first, after = self.places.rows_of(at.grid, at.region)
         first, after = self.share(first, after, at.part)
         last_axis = ti.static(self.dimension - 1)
         for row in range(first, after):
             node = at.grid.row_start(row)
             for _ in range(at.grid.row_length(node)):
-                ti.static(at.item)(at, node, self.values[at.w, RELAXED])
+                ti.static(at.item)(at, node, at.step.relaxed)
                 node[last_axis] += 1
 
     @ti.func
@@ -255,18 +399,18 @@ class CpuPhases(CpuContact):
             for r in range(first, after):
                 pencil = at.order.pencil_of(at.turn, r)
                 begin, end = at.order.first_particle_of(pencil), at.order.first_particle_of(pencil + 1)
-                ti.static(at.item)(at, begin, end, self.values[at.w, RELAXED])
+                ti.static(at.item)(at, begin, end, at.step.relaxed)
         if ti.static(self.device.comes_and_goes and not at.grid.sparse):
             if at.turn == self.colours and at.region == 0 and at.part == 0:
-                first, after = self.come_in(at.g, at.order, at.w, at.counts)
-                ti.static(at.item)(at, first, after, self.values[at.w, RELAXED])
+                first, after = self.come_in(at.g, at.order, at.run)
+                ti.static(at.item)(at, first, after, at.step.relaxed)
 
     @ti.func
     def each_particle(self, at: ti.template()):
         """Go through particles."""
-        first, after = self.places.particles_of(at.g, at.w, at.region, at.counts[at.w, self.count.particles[at.g]])
+        first, after = self.places.particles_of(at.g, at.w, at.region, at.run.particles[at.g])
         first, after = self.share(first, after, at.part)
-        ti.static(at.item)(at, first, after, self.values[at.w, RELAXED])
+        ti.static(at.item)(at, first, after, at.step.relaxed)
 
     @ti.func
     def clear(self, at: ti.template()):
@@ -298,10 +442,10 @@ class CpuPhases(CpuContact):
         return first, after
 
     @ti.func
-    def come_in(self, g: ti.template(), order: ti.template(), w: int, counts: ti.template()):
+    def come_in(self, g: ti.template(), order: ti.template(), run: ti.template()):
         """Return the first particle that came in since the last sort, and the one after the last."""
         first = order.start[order.first_tile + order.tiles]
-        return first, w * ti.static(self.device.room[g]) + counts[w, self.count.particles[g]]
+        return first, run.w * ti.static(self.device.capacity[g]) + run.particles[g]
 
     @ti.func
     def average(self, at: ti.template()):
@@ -310,41 +454,33 @@ class CpuPhases(CpuContact):
             first, after = self.pencils(at.order, at.turn, at.region, at.part)
             average_pencils(at, first, after)
         elif at.region == 0 and at.part == 0:
-            first, after = self.come_in(at.g, at.order, at.w, at.counts)
+            first, after = self.come_in(at.g, at.order, at.run)
             average_range(at.grid, at.g, at.group, first, after)
 
     @ti.func
     def scatter(self, at: ti.template()):
         """Scatter particles of the g-th group."""
-        kick, relaxed = self.values[at.w, KICK], self.values[at.w, RELAXED]
+        kick, relaxed = at.step.kick, at.step.relaxed
         if at.turn < self.colours:
             first, after = self.pencils(at.order, at.turn, at.region, at.part)
             scatter_pencils(at, first, after, kick, relaxed)
         # On a sparse grid a sort follows on what comes in.
         if ti.static(self.device.comes_and_goes and not at.grid.sparse):
             if at.turn == self.colours and at.region == 0 and at.part == 0:
-                first, after = self.come_in(at.g, at.order, at.w, at.counts)
+                first, after = self.come_in(at.g, at.order, at.run)
                 scatter_range(at.particles, at.g, at.group, first, after, kick, relaxed)
 
     @ti.func
     def relax(self, at: ti.template()):
         """Relax the volumes of particles of the g-th group, in the steps that do."""
-        relaxed = self.values[at.w, RELAXED]
+        relaxed = at.step.relaxed
         if relaxed > 0.0:
-            first, after = self.places.particles_of(at.g, at.w, at.region, at.counts[at.w, self.count.particles[at.g]])
+            first, after = self.places.particles_of(at.g, at.w, at.region, at.run.particles[at.g])
             first, after = self.share(first, after, at.part)
             change = 0.0
             for p in range(first, after):
                 change = ti.max(change, at.particles.relax(self.device.groups[at.g], p, relaxed))
-            ti.atomic_max(self.values[at.w, self.rates + 2 * at.g + 1], change)
-
-    @ti.func
-    def gravity_step(self, w: int):
-        """Return by how much gravity changes velocities in this step, m/s."""
-        result = ti.Vector.zero(float, self.dimension)
-        for a in ti.static(range(self.dimension)):
-            result[a] = self.values[w, VECTORS + a]
-        return result
+            ti.atomic_max(at.step.volume_change[at.g], change)
 
     @ti.func
     def find_contact(self, at: ti.template()):
@@ -359,7 +495,7 @@ class CpuPhases(CpuContact):
     @ti.func
     def each_plane_node(self, at: ti.template(), rubs: ti.template()):
         """Find friction, or else contact, at the nodes in use of the planes of faces."""
-        gravity_step = self.gravity_step(at.w)
+        gravity_step = self.gravity_of(at.step)
         layers = 1
         if ti.static(rubs):
             # Where bodies meet walls by their surfaces walls do not find whether they press.
@@ -379,7 +515,7 @@ class CpuPhases(CpuContact):
     @ti.func
     def update(self, at: ti.template()):
         """Turn the momentum of nodes into velocity."""
-        ti.atomic_max(self.values[at.w, SPEED], self.updated(at, False))
+        ti.atomic_max(at.step.speed_squared, self.updated(at, False))
 
     @ti.func
     def updated(self, at: ti.template(), meets: ti.template()):
@@ -390,14 +526,14 @@ class CpuPhases(CpuContact):
             first, after = self.places.even_part(at.grid.sizes[PENCILS], at.region)
             first, after = self.share(first, after, at.part)
             begin, end = at.grid.pencils[first], at.grid.pencils[after]
-            speed_squared = update_blocks(at, begin, end, self.gravity_step(at.w), meets)
+            speed_squared = update_blocks(at, begin, end, self.gravity_of(at.step), meets)
         else:
             first, after = self.places.rows_of(at.grid, at.region)
             first, after = self.share(first, after, at.part)
             for layer in range(self.layer_count(at)):
                 own = self.used_by(at, layer)
                 (inner,) = ti.static((at.in_layer(layer, own),))
-                speed_squared = ti.max(speed_squared, update_rows(inner, first, after, self.gravity_step(at.w), meets))
+                speed_squared = ti.max(speed_squared, update_rows(inner, first, after, self.gravity_of(at.step), meets))
         return speed_squared
 
     @ti.func
@@ -406,32 +542,100 @@ class CpuPhases(CpuContact):
         if at.turn % 2 == 0:
             self.updated(at, True)
         elif at.region == 0 and at.part == 0:
-            at.nodes.rigid.solve(at.w, at.numbers[at.w, self.real.step])
+            at.nodes.rigid.solve(at.w, at.run.dt)
 
     @ti.func
     def move_bodies(self, at: ti.template()):
         """Move rigid bodies, with what the nodes lost to them."""
         if at.region == 0 and at.part == 0:
-            dt = at.numbers[at.w, self.real.step]
-            at.nodes.rigid.take(at.w, dt)
-            self.device.rigid_contact.resolve(at.w, dt, at.particles.extent, at.nodes.colliders)
-            speed_squared = at.nodes.rigid.move(at.w, dt)
-            ti.atomic_max(self.values[at.w, SPEED], speed_squared)
+            self.move_rigid(at)
 
     @ti.func
     def advance(self, at: ti.template()):
         """Gather and move particles of the g-th group."""
-        dt, rate, gravity_step = self.values[at.w, MOVED], self.rates + 2 * at.g, self.gravity_step(at.w)
+        dt, gravity_step = at.step.dt, self.gravity_of(at.step)
         if ti.static(at.grid.sparse):
             first, after = self.places.pencils_of(at.g, at.region)
             first, after = self.share(first, after, at.part)
             begin, end = at.order.first_tile_of(first), at.order.first_tile_of(after)
-            ti.atomic_max(self.values[at.w, rate], advance_tiles(at, begin, end, dt, gravity_step))
+            ti.atomic_max(at.step.rate[at.g], advance_tiles(at, begin, end, dt, gravity_step))
         else:
-            first, after = self.places.particles_of(at.g, at.w, at.region, at.counts[at.w, self.count.particles[at.g]])
+            first, after = self.places.particles_of(at.g, at.w, at.region, at.run.particles[at.g])
             first, after = self.share(first, after, at.part)
-            sharpest = advance_range(at.particles, at.g, self.device.groups[at.g], first, after, dt, gravity_step)
-            ti.atomic_max(self.values[at.w, rate], sharpest)
+            rate = advance_range(at.particles, at.g, self.device.groups[at.g], first, after, dt, gravity_step)
+            ti.atomic_max(at.step.rate[at.g], rate)
+
+    # Bodies with velocity fields of their own, see `contact.body_contact`.
+
+    @ti.func
+    def layer_count(self, at: ti.template()):
+        """Return the number of layers: one that compilers do not know, as they would repeat what is done for each."""
+        count = 1
+        if ti.static(self.separates):
+            count = self.device.contact.surfaces.count[at.w]
+        return count
+
+    @ti.func
+    def used_by(self, at: ti.template(), layer: int):
+        """Return what a layer has in use, as `Grid.box`."""
+        own = ti.Matrix.zero(int, 2, self.dimension)
+        if ti.static(self.separates):
+            for i, a in ti.static(ti.ndrange(2, self.dimension)):
+                own[i, a] = self.device.contact.surfaces.used[(at.w * ti.static(at.grid.layers) + layer) * 2 + i, a]
+        return own
+
+    @ti.func
+    def near_bodies(self, at: ti.template()):
+        """Return the box of the nodes where bodies may meet, as `Grid.box`."""
+        box = ti.Matrix.zero(int, 2, self.dimension)
+        for i, a in ti.static(ti.ndrange(2, self.dimension)):
+            box[i, a] = self.device.contact.surfaces.box[at.w * 2 + i, a]
+        return box
+
+    @ti.func
+    def rows_near_bodies(self, grid: ti.template(), at: ti.template()):
+        """Return the first of a part of the rows of nodes where bodies may meet, and the one after the last."""
+        first, after = self.places.even_part(grid.row_count(), at.region)
+        return self.share(first, after, at.part)
+
+    @ti.func
+    def find_bodies(self, at: ti.template()):
+        """Find where two bodies meet."""
+        box = self.near_bodies(at)
+        grid, obstacles = ti.static((at.grid.within(box), obstacles_of(at)))
+        first, after = self.rows_near_bodies(grid, at)
+        self.device.contact.surfaces.find_rows(grid, obstacles, at.w, first, after)
+
+    @ti.func
+    def show_surface(self, at: ti.template()):
+        """Find what particles of the g-th group show."""
+        box = self.near_bodies(at)
+        (grid,) = ti.static((at.grid.within(box),))
+        first, after = self.places.even_part(self.device.contact.surfaces.tile_count(grid, at.w), at.region)
+        first, after = self.share(first, after, at.part)
+        for q in range(first, after):
+            self.device.contact.surfaces.show(at.g, grid, at.w, q)
+
+    @ti.func
+    def link_surfaces(self, at: ti.template()):
+        """Put what particles show into the bins of their nodes, on one thread, in their order."""
+        if at.region == 0 and at.part == 0:
+            box = self.near_bodies(at)
+            (grid,) = ti.static((at.grid.within(box),))
+            for q in range(self.device.contact.surfaces.tile_count(grid, at.w)):
+                for g in ti.static(self.device.contact.surfaces.surfaced):
+                    self.device.contact.surfaces.link(g, grid, at.w, q)
+
+    @ti.func
+    def exchange(self, at: ti.template()):
+        """Let bodies that meet at nodes exchange momentum, and walls and colliders push them."""
+        box, gravity_step = self.near_bodies(at), self.gravity_of(at.step)
+        grid, obstacles = ti.static((at.grid.within(box), obstacles_of(at)))
+        first, after = self.rows_near_bodies(grid, at)
+        thread = at.w * ti.static(self.regions) + at.t
+        self.device.contact.exchange_rows(grid, obstacles, at.w, thread, first, after, at.step.dt, gravity_step)
+
+    # Sorts, and frames.
 
     @ti.func
     def forget(self, at: ti.template()):
@@ -442,16 +646,16 @@ class CpuPhases(CpuContact):
     @ti.func
     def mark(self, at: ti.template()):
         """Mark the tiles of the share of a region in the particles of the g-th group."""
-        first, after = self.places.even_part(at.counts[at.w, self.count.capacity[at.g]], at.region)
+        first, after = self.places.even_part(at.run.capacity[at.g], at.region)
         at.grid.mark(at.order, first, after)
 
     @ti.func
     def sort(self, at: ti.template()):
         """Do the share of a region in a phase of the sort of the g-th group."""
-        first = at.w * ti.static(self.device.room[at.g])
-        begin, end = self.places.even_part(at.counts[at.w, self.count.capacity[at.g]], at.region)
+        first = at.w * ti.static(self.device.capacity[at.g])
+        begin, end = self.places.even_part(at.run.capacity[at.g], at.region)
         # Other runs may be at other groups, which begin elsewhere: the scratch memory of a run is that of no other.
-        own = at.w * ti.static(self.device.orders[at.g].buffers.room)
+        own = at.w * ti.static(self.device.orders[at.g].buffers.capacity)
         if at.turn == 0:
             count_tiles(at.order, at.w, at.region, first, begin, end)
         if at.turn == 1:
@@ -466,35 +670,37 @@ class CpuPhases(CpuContact):
     def average_shown(self, at: ti.template()):
         """Average the volumes of the g-th group for a frame."""
         if at.region == 0:
-            first = at.w * ti.static(self.device.room[at.g])
-            average_for_frame(at.grid, at.g, at.group, first, first + at.counts[at.w, self.count.particles[at.g]])
+            first = at.w * ti.static(self.device.capacity[at.g])
+            average_for_frame(at.grid, at.g, at.group, first, first + at.run.particles[at.g])
 
     @ti.func
     def show(self, at: ti.template()):
         """Write what particles of the g-th group show."""
-        first, after = self.places.particles_of(at.g, at.w, at.region, at.counts[at.w, self.count.particles[at.g]])
+        first, after = self.places.particles_of(at.g, at.w, at.region, at.run.particles[at.g])
         if ti.static(self.device.comes_and_goes):
             # All of them, those that wait and those that left included.
-            first, after = self.places.even_part(at.counts[at.w, self.count.capacity[at.g]], at.region)
-            first += at.w * ti.static(self.device.room[at.g])
-            after += at.w * ti.static(self.device.room[at.g])
+            first, after = self.places.even_part(at.run.capacity[at.g], at.region)
+            first += at.w * ti.static(self.device.capacity[at.g])
+            after += at.w * ti.static(self.device.capacity[at.g])
         first, after = self.share(first, after, at.part)
-        row, last_step = at.counts[at.w, self.count.row], ti.cast(at.numbers[at.w, self.real.last_step], float)
-        affine, gradient = at.counts[at.w, self.count.affine], at.counts[at.w, self.count.gradient]
-        tau, activity = at.counts[at.w, self.count.tau], at.counts[at.w, self.count.activity]
-        scratch, room = ti.static((self.device.orders[at.g].buffers, self.device.room[at.g]))
-        offset = scratch_offset(scratch, at.g, at.w, room)
+        scratch, capacity = ti.static((self.device.orders[at.g].buffers, self.device.capacity[at.g]))
+        offset = scratch_offset(scratch, at.g, at.w, capacity)
         show_range(
             at.group,
             first,
             after - first,
-            last_step,
-            row,
-            affine,
-            gradient,
-            tau,
-            activity,
-            at.shown,
+            ti.cast(at.run.last_step, float),
+            at.run.row,
+            at.run.affine,
+            at.run.gradient,
+            at.run.tau,
+            at.run.activity,
+            at.frame_buffer,
             scratch.real,
             offset,
         )
+
+
+def obstacles_of(at: Part) -> Obstacles:
+    """Return the walls and colliders of the run of a part."""
+    return Obstacles(at.nodes.images.walls, at.nodes.colliders, at.grid.spacing)

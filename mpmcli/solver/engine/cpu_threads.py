@@ -94,7 +94,9 @@ class CpuThreads:
         return claimed >> BITS == self.words[word + NUMBER] and (claimed & MASK) < parts
 
     @ti.func
-    def help(self, w: int, t: int, idle: int, numbers: ti.template(), counts: ti.template(), shown: ti.template()):
+    def help(
+        self, w: int, t: int, idle: int, numbers: ti.template(), counts: ti.template(), frame_buffer: ti.template()
+    ):
         """Let thread t do a part of the phase that is published, if one is left.
 
         idle: times in a row that it has found none. Returns 1 where it did, 0 where none was left, and -1 where the
@@ -116,7 +118,7 @@ class CpuThreads:
                     part = ti.cast(claimed & MASK, int)
             turn += 1
         if found == 1:
-            self.phases.do(0, w, ti.cast(self.words[word + PHASE], int), region, part, t, numbers, counts, shown)
+            self.phases.do(0, w, ti.cast(self.words[word + PHASE], int), region, part, t, numbers, counts, frame_buffer)
             ti.atomic_add(self.words[word + DONE], 1)
         elif ti.atomic_add(self.words[word + OVER], 0) == 1:
             found = -1

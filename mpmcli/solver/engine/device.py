@@ -4,6 +4,8 @@ from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
 
+import numpy as np
+
 from mpmcli.boundaries.colliders import ColliderMotion, Colliders
 from mpmcli.boundaries.rigid_bodies import RigidBodies
 from mpmcli.boundaries.rigid_contact import RigidContact
@@ -11,13 +13,15 @@ from mpmcli.boundaries.walls import MovingFaces, RoughFaces, Walls
 from mpmcli.quick_taichi import ti
 from mpmcli.solver.contact.body_contact import BodyContact
 from mpmcli.solver.drive.forces import DriveValues, Gravity
-from mpmcli.solver.engine.phases import Phase, step_phases
+from mpmcli.solver.engine.run_state import Layout, RunState, StepState
+from mpmcli.solver.engine.step import Phase, step_phases
 from mpmcli.solver.grid.grid import Grid
 from mpmcli.solver.particles.arrays import ParticleArrays
 from mpmcli.solver.particles.inflow import Emission
 from mpmcli.solver.particles.sort import TileOrder
 from mpmcli.solver.transfer.node_update import NodeUpdate
-from mpmcli.solver.transfer.particle_update import ParticleUpdate
+from mpmcli.solver.transfer.particle_update import NOT_LOST, ParticleUpdate
+from mpmcli.solver.transfer.splines import PAD
 
 
 @dataclass(frozen=True)
@@ -25,7 +29,7 @@ class Device:
     """What a batch has on the device.
 
     Attributes:
-        runs: number of runs; room: particles of each, per group.
+        runs: number of runs; capacity: particles of each, per group.
         groups, orders: of each law, with the particles of all runs.
         friction, moving: coefficients and velocities of the walls of each run.
         colliders, motion: those of each run, and how they move; None where there are none.
@@ -36,10 +40,11 @@ class Device:
         stencils: (2 runs, d) int, of each run the first and the last node per axis at which a stencil began when
             particles were sorted; None on a GPU.
         sorts: whether particles are sorted; several small runs on a GPU use all nodes of their domains instead.
+        drift_allowed: cells that particles may drift before they are sorted.
     """
 
     runs: int
-    room: Sequence[int]
+    capacity: Sequence[int]
     threads: int
     grid: Grid
     groups: Sequence[ParticleArrays]
@@ -59,6 +64,7 @@ class Device:
     contact: BodyContact | None = None
     stencils: ti.Field | None = None
     sorts: bool = True
+    drift_allowed: float = 1.0
 
     @property
     def comes_and_goes(self) -> bool:
@@ -70,7 +76,7 @@ class Device:
         """What a step consists of."""
         return step_phases(
             [group.law for group in self.groups],
-            [group.averaged for group in self.groups],
+            [group.uses_f_bar for group in self.groups],
             contact=self.nodes.needs_contact and (self.contact is None or self.contact.surfaces.shares),
             friction=self.nodes.needs_friction,
             deterministic=self.grid.deterministic,
@@ -88,51 +94,141 @@ def _changed(thing: object, **attributes: object) -> object:
     return result
 
 
-def views(
-    device: Device, w: object, h: object, inverse: object, scale: object, box: object, last: object, extent: object
-) -> tuple[Grid, NodeUpdate, ParticleUpdate, tuple[TileOrder, ...], tuple[ParticleArrays, ...]]:
-    """Return the grid, the updates, the orders and the groups of one run.
+class RunView:
+    """What a kernel has of one run: its numbers, and copies of what the device has, with numbers of the run in them.
 
-    w: its number. This and what follows are variables of the kernel; h, inverse, scale: spacing, inverse_spacing and
-    gradient_scale of the `Grid`; box: its box; last: node of the upper walls per axis; extent: size of the domain, m.
+    Attributes:
+        run, step: its numbers, and those of its step; w: its number.
+        grid, nodes, particles: its grid, and the updates of its nodes and particles.
+        orders, groups: of each law.
     """
-    fixed, fine = device.grid.fixed, device.grid.fine
-    grid = _changed(
-        device.grid,
-        fixed=None if fixed is None else _changed(fixed, run=w),
-        fine=None if fine is None else _changed(fine, first_node=w * fine.node_count),
-        spacing=h,
-        inverse_spacing=inverse,
-        gradient_scale=scale,
-        box=box,
-        first_node=w * (device.grid.layers * device.grid.node_count),
-        period=device.grid.period.seen_from(w),
-    )
-    friction = _changed(device.friction, first=w * len(device.friction.faces))
-    moving = _changed(device.moving, first=w * len(device.moving.faces))
-    walls = _changed(device.walls, last=last, friction=friction, moving=moving)
-    walls.first_plane = w * (device.grid.layers * len(walls.separating))
-    walls.first_rough = w * (device.grid.layers * len(walls.rough))
-    images = _changed(device.nodes.images, walls=walls)
-    colliders, rigid = device.colliders, device.rigid
-    if colliders is not None:
-        colliders = _changed(colliders, run=w, spacing=h)
-    if rigid is not None:
-        rigid = _changed(rigid, run=w, colliders=colliders)
-    nodes = _changed(device.nodes, grid=grid, images=images, colliders=colliders, rigid=rigid)
-    particles = _changed(
-        device.particles,
-        grid=grid,
-        near=grid,
-        extent=extent,
-        last=last,
-        first_lost=w * len(device.groups),
-        friction=friction,
-        moving=moving,
-        run=w,
-    )
-    orders = tuple(
-        _changed(order, grid=grid, extent=extent, first_tile=w * (order.bins + 1)) for order in device.orders
-    )
-    groups = tuple(group.seen_from(w) if group.pushed or group.repeats else group for group in device.groups)
-    return grid, nodes, particles, orders, groups
+
+    def __init__(
+        self,
+        device: Device,
+        run: RunState,
+        step: StepState,
+        h: object,
+        inverse: object,
+        scale: object,
+        box: object,
+        last: object,
+        extent: object,
+    ) -> None:
+        """Copy; h, inverse, scale: spacing, inverse_spacing and gradient_scale of the `Grid`; box: its box.
+
+        These and what follows are variables of the kernel: last: node of the upper walls per axis; extent: of the
+        domain, m.
+        """
+        w, fixed, fine = run.w, device.grid.fixed, device.grid.fine
+        self.run, self.step, self.w = run, step, w
+        self.grid = _changed(
+            device.grid,
+            fixed=None if fixed is None else _changed(fixed, run=w),
+            fine=None if fine is None else _changed(fine, first_node=w * fine.node_count),
+            spacing=h,
+            inverse_spacing=inverse,
+            gradient_scale=scale,
+            box=box,
+            first_node=w * (device.grid.layers * device.grid.node_count),
+            period=device.grid.period.seen_from(w),
+        )
+        friction = _changed(device.friction, first=w * len(device.friction.faces))
+        moving = _changed(device.moving, first=w * len(device.moving.faces))
+        walls = _changed(device.walls, last=last, friction=friction, moving=moving)
+        walls.first_plane = w * (device.grid.layers * len(walls.separating))
+        walls.first_rough = w * (device.grid.layers * len(walls.rough))
+        images = _changed(device.nodes.images, walls=walls)
+        colliders, rigid = device.colliders, device.rigid
+        if colliders is not None:
+            colliders = _changed(colliders, run=w, spacing=h)
+        if rigid is not None:
+            rigid = _changed(rigid, run=w, colliders=colliders)
+        self.nodes = _changed(device.nodes, grid=self.grid, images=images, colliders=colliders, rigid=rigid)
+        self.particles = _changed(
+            device.particles,
+            grid=self.grid,
+            near=self.grid,
+            extent=extent,
+            last=last,
+            first_lost=w * len(device.groups),
+            friction=friction,
+            moving=moving,
+            run=w,
+        )
+        self.orders = tuple(
+            _changed(order, grid=self.grid, extent=extent, first_tile=w * (order.bins + 1)) for order in device.orders
+        )
+        self.groups = tuple(
+            group.seen_from(w) if group.has_body_force or group.repeats else group for group in device.groups
+        )
+
+
+@ti.data_oriented
+class RunPhases:
+    """What the bodies of phases need of the runs of a batch on any device.
+
+    Attributes:
+        values: the numbers of the step of each run, see `run_state.STEP`.
+        members: (number, group) of each law.
+    """
+
+    def __init__(self, device: Device, layout: Layout) -> None:
+        self.device, self.layout, self.dimension = device, layout, device.grid.dimension
+        self.members = tuple(enumerate(device.groups))
+        self.values = ti.field(float, shape=(device.runs, layout.widths["step"]))
+
+    def state(self, w: object, numbers: object, counts: object) -> RunState:
+        """Return the numbers of a run."""
+        return RunState(self.layout, numbers, counts, w)
+
+    def step_of(self, w: object) -> StepState:
+        """Return the numbers of the step of a run."""
+        return StepState(self.layout, self.values, w)
+
+    def step_on_host(self, values: np.ndarray) -> StepState:
+        """Return the numbers of the steps of all runs, in `values`."""
+        return StepState(self.layout, values, slice(None))
+
+    @ti.func
+    def end_step(self, run: ti.template()):
+        """Store the rates of a step; return the largest speed of a node, m/s, -1 where a particle was lost."""
+        (step,) = ti.static((self.step_of(run.w),))
+        speed = ti.sqrt(step.speed_squared)
+        for g in ti.static(range(len(self.members))):
+            # What the relaxation adds to the rate of deformation.
+            run.rate[g] = ti.cast(step.volume_change[g], ti.f64) / run.dt + ti.cast(step.rate[g], ti.f64)
+            if self.device.particles.lost[run.w * ti.static(len(self.members)) + g] != NOT_LOST:
+                speed = -1.0
+        return ti.cast(speed, ti.f64)
+
+    @ti.func
+    def see(self, run: ti.template()):
+        """Return the view of a run, a tuple."""
+        d = ti.static(self.dimension)
+        (step,) = ti.static((self.step_of(run.w),))
+        last = ti.Vector.zero(int, d)
+        extent = ti.Vector.zero(float, d)
+        box = ti.Matrix.zero(int, 2, d)
+        for a in ti.static(range(d)):
+            last[a] = PAD + run.cells[a]
+            extent[a] = step.extent[a]
+            for i in ti.static(range(2)):
+                box[i, a] = self.device.grid.box[run.w * 2 + i, a]
+        h, inverse, scale = step.spacing, step.inverse_spacing, step.gradient_scale
+        return ti.static((RunView(self.device, run, step, h, inverse, scale, box, last, extent),))
+
+    @ti.func
+    def move_rigid(self, at: ti.template()):
+        """Move rigid bodies, with what the nodes lost to them."""
+        at.nodes.rigid.take(at.w, at.run.dt)
+        self.device.rigid_contact.resolve(at.w, at.run.dt, at.particles.extent, at.nodes.colliders)
+        ti.atomic_max(at.step.speed_squared, at.nodes.rigid.move(at.w, at.run.dt))
+
+    @ti.func
+    def gravity_of(self, step: ti.template()):
+        """Return the change of velocity by gravity in a step, m/s."""
+        result = ti.Vector.zero(float, self.dimension)
+        for a in ti.static(range(self.dimension)):
+            result[a] = step.gravity[a]
+        return result

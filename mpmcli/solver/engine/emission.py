@@ -10,10 +10,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from mpmcli.boundaries.doubles import as_double
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene, highest_speed
 from mpmcli.solver.engine.device import Device
-from mpmcli.solver.engine.run_numbers import Layout, Row
+from mpmcli.solver.engine.run_state import Layout, RunState
 from mpmcli.solver.particles.inflow import RETRY, first_ids
 from mpmcli.solver.particles.sort import ACTIVE, BLOCKED, WAITING
 
@@ -25,52 +26,50 @@ class CpuEmission:
     needed: whether there are any emitters.
     """
 
-    def __init__(self, device: Device, layout: Layout, stencils: ti.Field) -> None:
+    def __init__(self, device: Device, stencils: ti.Field) -> None:
         """Prepare; `stencils` has of each run and axis the first and the last node at which a stencil began."""
         self.stencils, self.separates = stencils, device.contact is not None
-        self.device, self.real, self.count = device, layout.real, layout.count
-        self.emission = device.emission
+        self.device, self.emission = device, device.emission
         self.needed = device.emission is not None
         # Of each its number, that of its law, and its particles.
         self.emitters = tuple((e, g, device.groups[g]) for e, g in (device.emission.members if self.needed else ()))
         self.numbered = tuple(enumerate(device.groups))
 
     @ti.func
-    def enter(self, orders: ti.template(), w: int, numbers: ti.template(), counts: ti.template()):
+    def enter(self, orders: ti.template(), run: ti.template()):
         """Let all sheets enter that are due and find room."""
-        time, due = numbers[w, self.real.time], numbers[w, self.real.infinity]
+        time, due, w = run.time, as_double(math.inf), run.w
         for e, g, group in ti.static(self.emitters):
-            going = self.is_left(e, w, numbers, counts)
-            while going and numbers[w, self.real.due_of[e]] <= time:
-                late = ti.cast(time - numbers[w, self.real.due_of[e]], float)
-                period = numbers[w, self.real.period[e]]
-                sheet, blocked, layer = counts[w, self.count.entered[e]], 0, 1
-                first = w * ti.static(self.device.room[g])
-                begin, after = first + counts[w, self.count.particles[g]], first + counts[w, self.count.capacity[g]]
+            going = self.is_left(e, run)
+            while going and run.due_of[e] <= time:
+                late = ti.cast(time - run.due_of[e], float)
+                sheet, blocked, layer = run.entered[e], 0, 1
+                first = w * ti.static(self.device.capacity[g])
+                begin, after = first + run.particles[g], first + run.capacity[g]
                 if sheet % self.emission.ids[w, e][2] == 0:
-                    self.look(e, w, sheet, late, counts)
+                    self.look(e, run, sheet, late)
                     blocked = self.emission.count_blocked(e, group, w, sheet, begin, after)
                     layer = self.emission.particles_of(e, w, sheet, self.emission.ids[w, e][2])
                 if 2 * blocked >= layer:
-                    numbers[w, self.real.due_of[e]] = time + RETRY * period * self.emission.ids[w, e][2]
-                    if counts[w, self.count.waits[e]] == 0:
-                        counts[w, self.count.waits[e]] = 1
-                        counts[w, self.count.blocked] += layer
+                    run.due_of[e] = time + RETRY * run.period[e] * self.emission.ids[w, e][2]
+                    if run.waits[e] == 0:
+                        run.waits[e] = 1
+                        run.blocked += layer
                 else:
                     if blocked > 0:
                         self.emission.keep_out(e, group, w, sheet, begin, after)
-                    counts[w, self.count.blocked] += blocked
+                    run.blocked += blocked
                     end = self.emission.enter(e, group, w, sheet, late, begin, after)
-                    counts[w, self.count.particles[g]] = end - first
+                    run.particles[g] = end - first
                     for p in range(begin, end):
                         self.widen(orders[g], w, p)
-                    counts[w, self.count.entered[e]] = sheet + 1
-                    counts[w, self.count.waits[e]] = 0
-                    numbers[w, self.real.due_of[e]] = numbers[w, self.real.due_of[e]] + period
-                going = self.is_left(e, w, numbers, counts)
+                    run.entered[e] = sheet + 1
+                    run.waits[e] = 0
+                    run.due_of[e] = run.due_of[e] + run.period[e]
+                going = self.is_left(e, run)
             if going:
-                due = ti.min(due, numbers[w, self.real.due_of[e]])
-        numbers[w, self.real.due] = due
+                due = ti.min(due, run.due_of[e])
+        run.due = due
 
     @ti.func
     def widen(self, order: ti.template(), w: int, p: int):
@@ -84,29 +83,26 @@ class CpuEmission:
             self.device.contact.surfaces.widen(w * ti.static(self.device.grid.layers), base)
 
     @ti.func
-    def is_left(self, e: ti.template(), w: int, numbers: ti.template(), counts: ti.template()):
+    def is_left(self, e: ti.template(), run: ti.template()):
         """Return whether another sheet enters, at whatever time."""
-        before = numbers[w, self.real.due_of[e]] < numbers[w, self.real.until[e]]
-        return before and counts[w, self.count.entered[e]] < counts[w, self.count.sheets[e]]
+        return run.due_of[e] < run.until[e] and run.entered[e] < run.sheets[e]
 
     @ti.func
-    def look(self, e: ti.template(), w: int, sheet: int, late: float, counts: ti.template()):
+    def look(self, e: ti.template(), run: ti.template(), sheet: int, late: float):
         """Find which cells of the layer that begins with a sheet, which was due `late` s ago, hold a particle."""
-        self.emission.clear(e, w)
+        self.emission.clear(e, run.w)
         for g, group in ti.static(self.numbered):
-            first = w * ti.static(self.device.room[g])
-            for p in range(first, first + counts[w, self.count.particles[g]]):
-                self.emission.mark(e, group, w, sheet, late, p)
+            first = run.w * ti.static(self.device.capacity[g])
+            for p in range(first, first + run.particles[g]):
+                self.emission.mark(e, group, run.w, sheet, late, p)
 
     @ti.func
-    def count_active(self, w: int, counts: ti.template()):
+    def count_active(self, run: ti.template()):
         """Count the particles that take part after a sort."""
         if ti.static(self.device.comes_and_goes):
             for g in ti.static(range(len(self.numbered))):
-                after = w * ti.static(self.device.orders[g].bins + 1) + ti.static(self.device.orders[g].tiles)
-                counts[w, self.count.particles[g]] = self.device.orders[g].start[after] - w * ti.static(
-                    self.device.room[g]
-                )
+                after = run.w * ti.static(self.device.orders[g].bins + 1) + ti.static(self.device.orders[g].tiles)
+                run.particles[g] = self.device.orders[g].start[after] - run.w * ti.static(self.device.capacity[g])
 
 
 @ti.data_oriented
@@ -121,40 +117,33 @@ class GpuEmission:
 
     def __init__(self, device: Device, layout: Layout, counts: ti.Field) -> None:
         self.device, self.emission, self.counts, self.runs = device, device.emission, counts, device.runs
-        self.real, self.count, self.room = layout.real, layout.count, tuple(device.room)
+        self.layout, self.capacity = layout, tuple(device.capacity)
         self.members = tuple(enumerate(device.groups))
         self.enters, self.sheet, self.blocked, self.layer = (ti.field(int, shape=self.runs) for _ in range(4))
         self.late = ti.field(float, shape=self.runs)
 
-    def enter(self, numbers: np.ndarray, counts: np.ndarray, going: np.ndarray) -> None:
-        """Let the sheets enter that are due in these runs."""
-        due = going & (numbers[:, self.real.due] <= numbers[:, self.real.time])
+    def enter(self, runs: RunState, going: np.ndarray) -> None:
+        """Let the sheets enter that are due in those of all runs that go on."""
+        due = going & (runs.due <= runs.time)
         while due.any():
             for e, _ in self.emission.members:
-                self._enter_one(e, numbers, counts, due)
-            numbers[due, self.real.drift] = np.inf
-            for w in np.flatnonzero(due):
-                left = [numbers[w, k] for e, k in enumerate(self.real.due_of) if self._is_left(e, w, numbers, counts)]
-                numbers[w, self.real.due] = min(left, default=np.inf)
-            due &= numbers[:, self.real.due] <= numbers[:, self.real.time]
+                self._enter_one(e, runs, due)
+            runs.drift[due] = np.inf
+            next_due = [np.where(self._is_left(e, runs), runs.due_of[e], np.inf) for e, _ in self.emission.members]
+            runs.due[due] = np.min(next_due, axis=0)[due]
+            due &= runs.due <= runs.time
 
-    def _is_left(self, e: int, w: int, numbers: np.ndarray, counts: np.ndarray) -> bool:
+    def _is_left(self, e: int, runs: RunState) -> np.ndarray:
         """Return whether another sheet of an emitter enters, at whatever time."""
-        before = numbers[w, self.real.due_of[e]] < numbers[w, self.real.until[e]]
-        return bool(before and counts[w, self.count.entered[e]] < counts[w, self.count.sheets[e]])
+        return (runs.due_of[e] < runs.until[e]) & (runs.entered[e] < runs.sheets[e])
 
-    def _enter_one(self, e: int, numbers: np.ndarray, counts: np.ndarray, due: np.ndarray) -> None:
+    def _enter_one(self, e: int, runs: RunState, due: np.ndarray) -> None:
         """Let one sheet of an emitter enter in each of these runs where it is due and finds room."""
-        time, due_of = numbers[:, self.real.time], numbers[:, self.real.due_of[e]]
-        asked = due & (due_of <= time) & [self._is_left(e, w, numbers, counts) for w in range(self.runs)]
+        asked = due & (runs.due_of[e] <= runs.time) & self._is_left(e, runs)
         if not asked.any():
             return
-        period, sheet, per_layer = (
-            numbers[:, self.real.period[e]],
-            counts[:, self.count.entered[e]].copy(),
-            self.emission.ids.to_numpy()[:, e, 2],
-        )
-        self.late.from_numpy(np.where(asked, time - due_of, 0.0).astype(self.device.groups[0].real))
+        per_layer, sheet = self.emission.ids.to_numpy()[:, e, 2], runs.entered[e].copy()
+        self.late.from_numpy(np.where(asked, runs.time - runs.due_of[e], 0.0).astype(self.device.groups[0].real))
         self.enters.from_numpy(asked.astype(np.int32))
         self.sheet.from_numpy(sheet)
         blocked, waits = np.zeros_like(sheet), np.zeros_like(asked)
@@ -162,15 +151,15 @@ class GpuEmission:
             self.find_blocked(e)
             blocked, layer = self.blocked.to_numpy(), self.layer.to_numpy()
             waits = asked & (2 * blocked >= layer)
-            first_wait = waits & (counts[:, self.count.waits[e]] == 0)
-            counts[first_wait, self.count.blocked] += layer[first_wait]
+            first_wait = waits & (runs.waits[e] == 0)
+            runs.blocked[first_wait] += layer[first_wait]
         enters = asked & ~waits
-        counts[waits, self.count.waits[e]] = 1
-        numbers[waits, self.real.due_of[e]] = (time + RETRY * period * per_layer)[waits]
-        counts[enters, self.count.blocked] += blocked[enters]
-        counts[enters, self.count.entered[e]] += 1
-        counts[enters, self.count.waits[e]] = 0
-        numbers[enters, self.real.due_of[e]] += period[enters]
+        runs.waits[e][waits] = 1
+        runs.due_of[e][waits] = (runs.time + RETRY * runs.period[e] * per_layer)[waits]
+        runs.blocked[enters] += blocked[enters]
+        runs.entered[e][enters] += 1
+        runs.waits[e][enters] = 0
+        runs.due_of[e][enters] += runs.period[e][enters]
         self.enters.from_numpy(enters.astype(np.int32))
         self.let_enter(e)
 
@@ -184,12 +173,12 @@ class GpuEmission:
             if self.looks(e, w):
                 self.layer[w] = self.emission.particles_of(e, w, self.sheet[w], self.emission.ids[w, e][2])
         for g, group in ti.static(self.members):
-            for p in range(self.runs * self.room[g]):
-                w = p // self.room[g]
+            for p in range(self.runs * self.capacity[g]):
+                w = p // self.capacity[g]
                 if self.looks(e, w) and self.is_one(g, w, p) and group.activity[p] == ACTIVE:
                     self.emission.mark(e, group, w, self.sheet[w], self.late[w], p)
-        for p in range(self.runs * self.room[source]):
-            w = p // self.room[source]
+        for p in range(self.runs * self.capacity[source]):
+            w = p // self.capacity[source]
             if self.looks(e, w) and self.is_one(source, w, p):
                 self.blocked[w] += ti.cast(
                     self.emission.keeps_out(e, self.device.groups[source], w, p, self.sheet[w]), int
@@ -203,15 +192,15 @@ class GpuEmission:
     @ti.func
     def is_one(self, g: ti.template(), w: int, p: int):
         """Return whether a run has a particle at place p of a group."""
-        return p - w * self.room[g] < self.counts[w, self.count.capacity[g]]
+        return p - w * self.capacity[g] < self.counts[w, ti.static(self.layout.counts["capacity"][g])]
 
     @ti.kernel
     def let_enter(self, e: ti.template()):
         """Let what has room of the next sheet of an emitter take part, and keep out what has none of its layer."""
         g = ti.static(self.emission.members[e][1])
         (group,) = ti.static((self.device.groups[g],))
-        for p in range(self.runs * self.room[g]):
-            w = p // self.room[g]
+        for p in range(self.runs * self.capacity[g]):
+            w = p // self.capacity[g]
             if self.enters[w] == 1 and self.is_one(g, w, p):
                 if self.looks(e, w) and self.emission.keeps_out(e, group, w, p, self.sheet[w]):
                     group.activity[p] = BLOCKED
@@ -224,18 +213,14 @@ def begin_emission(batch: object, slot: int, scene: Scene, particles: Sequence[i
 
     batch: the `Batch`; slot: place of the run in it; particles: number of them, of each source.
     """
-    numbers, counts, real, count = batch.numbers[slot], batch.counts[slot], batch.layout.real, batch.layout.count
-    row = Row(batch.layout, numbers, counts)
-    row.set(due=math.inf, slowest=max((highest_speed(emitter) for emitter in scene.emitters), default=0.0))
-    row.set_counts(blocked=0)
+    run = batch.state(slot)
+    run.slowest = max((highest_speed(emitter) for emitter in scene.emitters), default=0.0)
     if batch.device.emission is None:
         return
     found = batch.device.emission.write(scene, first_ids(scene, particles), slot)
     for e, (sheets, emitter) in enumerate(zip(found, scene.emitters, strict=True)):
         # A sheet enters at the first step after it was due; none is due from `until` on.
-        numbers[real.due_of[e]], numbers[real.period[e]] = sheets.start, sheets.period
-        numbers[real.until[e]] = min(scene.time.end, math.inf if emitter.end is None else emitter.end)
-        counts[count.entered[e]] = counts[count.waits[e]] = 0
-        counts[count.sheets[e]] = sheets.count
-        if sheets.count and sheets.start < numbers[real.until[e]]:
-            row.set(due=min(row.number("due"), sheets.start))
+        run.due_of[e], run.period[e], run.sheets[e] = sheets.start, sheets.period, sheets.count
+        run.until[e] = min(scene.time.end, math.inf if emitter.end is None else emitter.end)
+        if sheets.count and sheets.start < run.until[e]:
+            run.due = min(run.due, sheets.start)

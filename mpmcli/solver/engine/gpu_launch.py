@@ -3,38 +3,229 @@
 Each run takes steps of its own size, and rests where the host has to attend to it: to sort its particles, to let sheets
 of emitters enter, or for what its status says. Where the device has no double precision, the host counts the time and
 chooses the steps, with the same functions (`step_size.StepSize`), and a launch takes one step.
+
+Scatters add atomically: in any order, so that bytes differ from run to run, or in fixed point (`fixed_point`).
 """
 
 from collections.abc import Callable
 
 import numpy as np
 
-from mpmcli.boundaries.doubles import double_field
+from mpmcli.boundaries.doubles import as_double, double_field
+from mpmcli.boundaries.mirror_images import find_friction
+from mpmcli.boundaries.rigid_bodies import ROUNDS
 from mpmcli.quick_taichi import ti
 from mpmcli.solver.drive.forces import HostValues
-from mpmcli.solver.engine.device import Device
+from mpmcli.solver.engine.device import Device, RunPhases, RunView
 from mpmcli.solver.engine.emission import GpuEmission
-from mpmcli.solver.engine.gpu_phases import KICK, PULL, RELAXED, STABLE, STEP, GpuPhases
-from mpmcli.solver.engine.phases import Phase, sorted_fields
-from mpmcli.solver.engine.run_numbers import ATTEND, GOING, MEASURE, Layout
+from mpmcli.solver.engine.run_state import ATTEND, GOING, MEASURE, Layout, RunState
+from mpmcli.solver.engine.step import Phase, sorted_fields
 from mpmcli.solver.engine.step_size import StepSize
 from mpmcli.solver.frames.columns import FrameColumns
 from mpmcli.solver.frames.reader import chosen_columns, show_range
 from mpmcli.solver.grid.grid import box_of
 from mpmcli.solver.particles.sort import SPAN, keep, take
 from mpmcli.solver.particles.state_bounds import NOTHING, deformation_rate, entries, widen_motion, widen_state
+from mpmcli.solver.transfer.cpu_transfers import update_rows
 from mpmcli.solver.transfer.lanes import LANES
 from mpmcli.solver.transfer.particle_update import NOT_LOST
-from mpmcli.solver.transfer.redistribution import farthest_shift
 from mpmcli.solver.transfer.splines import PAD
+from mpmcli.solver.transfer.volume import add_volume, clear_mean, missing_to_mean
 from mpmcli.stability.transfer_factors import INTERVAL
+
+
+class Item:
+    """A node, a particle, or a row of nodes that a thread works on, with the view that its run has of the device.
+
+    run, step, grid, nodes, particles, order, group: see `RunView`; the last two are those of a group of particles. g:
+    number of the group; w: of the run; turn: of the phase; q: of the item. atomic: whether sums need atomics, True.
+    """
+
+    atomic = True
+
+    def __init__(self, view: RunView, phase: Phase, turn: int, q: object) -> None:
+        """Keep a view, and a variable of a kernel."""
+        g, self.item, self.turn, self.q = phase.group, phase.body, turn, q
+        self.run, self.step, self.w = view.run, view.step, view.w
+        self.grid, self.nodes, self.particles = view.grid, view.nodes, view.particles
+        self.g, self.group, self.order = g, view.groups[g], view.orders[g] if view.orders else None
+
+
+@ti.data_oriented
+class GpuPhases(RunPhases):
+    """The phases of the runs of a batch, w being the number of a run and q that of a node, a particle, or a row.
+
+    numbers, counts: those of `Batch` on the device; the numbers are None where it has no double precision.
+    """
+
+    def __init__(self, device: Device, layout: Layout, *, doubles: bool) -> None:
+        super().__init__(device, layout)
+        self.counts = ti.field(ti.i32, shape=(device.runs, layout.widths["counts"]))
+        self.numbers = double_field(device.runs, layout.widths["numbers"]) if doubles else None
+
+    def run(self, w: object) -> RunState:
+        """Return the numbers of a run."""
+        return self.state(w, self.numbers, self.counts)
+
+    @ti.func
+    def do(self, phase: ti.template(), turn: ti.template(), w: int, q: int):
+        """Do what a phase does for one item of a run in one of its turns."""
+        (run,) = ti.static((self.run(w),))
+        (view,) = ti.static(self.see(run))
+        (at,) = ti.static((Item(view, phase, turn, q),))
+        ti.static(self.body(phase))(at)
+
+    def body(self, phase: Phase) -> object:
+        """Return the method of a phase."""
+        if phase.shifts:
+            return self.shift_node if phase.over == "nodes" else self.shift_particle
+        if phase.body:
+            return self.each_node
+        return getattr(self, phase.name)
+
+    @ti.func
+    def each_node(self, at: ti.template()):
+        """Do what the phase says for a node."""
+        if at.q < at.grid.box_nodes():
+            ti.static(at.item)(at, at.grid.box_node(at.q), at.step.kick)
+
+    @ti.func
+    def shift_node(self, at: ti.template()):
+        """Do what the phase says for a node, in the steps that shift particles."""
+        if at.step.relaxed > 0.0 and at.q < at.grid.box_nodes():
+            ti.static(at.item)(at, at.grid.box_node(at.q), at.step.relaxed)
+
+    @ti.func
+    def shift_particle(self, at: ti.template()):
+        """Do what the phase says for a particle, in the steps that shift particles."""
+        if at.step.relaxed > 0.0:
+            ti.static(at.item)(at, at.q, at.step.relaxed)
+
+    @ti.func
+    def clear(self, at: ti.template()):
+        """Clear a node."""
+        if at.q < at.grid.box_nodes():
+            at.grid.clear(at.grid.linear_index(at.grid.box_node(at.q)))
+
+    @ti.func
+    def average(self, at: ti.template()):
+        """Add a particle to the averages of its cell."""
+        add_volume(at.grid, at.g, at.group, at.q)
+
+    @ti.func
+    def scatter(self, at: ti.template()):
+        """Scatter a particle."""
+        at.particles.scatter(at.g, at.group, at.q, at.step.kick, at.step.relaxed)
+
+    @ti.func
+    def to_float(self, at: ti.template()):
+        """Set a node from its sums in fixed point."""
+        if at.q < at.grid.box_nodes():
+            at.grid.fixed.to_float(at.grid, at.grid.linear_index(at.grid.box_node(at.q)), at.step.relaxed)
+
+    @ti.func
+    def relax(self, at: ti.template()):
+        """Relax the volume of a particle, in the steps that do."""
+        if at.step.relaxed > 0.0:
+            change = at.particles.relax(self.device.groups[at.g], at.q, at.step.relaxed)
+            if change > at.step.volume_change[at.g]:
+                ti.atomic_max(at.step.volume_change[at.g], change)
+
+    @ti.func
+    def find_contact(self, at: ti.template()):
+        """Find whether a wall that lets go is pressed."""
+        if at.q < at.nodes.images.plane_nodes(at.grid):
+            at.nodes.images.find_contact(at.grid, at.q, self.gravity_of(at.step))
+
+    @ti.func
+    def find_friction(self, at: ti.template()):
+        """Find the friction of a wall."""
+        if at.q < at.nodes.images.plane_nodes(at.grid):
+            find_friction(at.nodes.images, at.grid, at.q, self.gravity_of(at.step))
+
+    @ti.func
+    def update(self, at: ti.template()):
+        """Turn the momentum of a node into velocity."""
+        if at.q < at.grid.box_nodes():
+            node = at.grid.box_node(at.q)
+            squared = at.nodes.update(node, at.grid.linear_index(node), self.gravity_of(at.step))
+            # The comparison may be late, and saves most atomics.
+            if squared > at.step.speed_squared:
+                ti.atomic_max(at.step.speed_squared, squared)
+
+    @ti.func
+    def meet(self, at: ti.template()):
+        """Find the velocities of rigid bodies: add up what nodes would give them, and then solve for it."""
+        if ti.static(at.turn % 2 == 0):
+            if at.q < at.grid.row_count():
+                _speed = update_rows(at, at.q, at.q + 1, self.gravity_of(at.step), True)
+        elif at.q == 0:
+            at.nodes.rigid.solve(at.w, at.run.dt)
+
+    @ti.func
+    def move_bodies(self, at: ti.template()):
+        """Move rigid bodies."""
+        self.move_rigid(at)
+
+    @ti.func
+    def add_loads(self, at: ti.template()):
+        """Add up what the nodes of a row gave to a collider, in their order."""
+        at.nodes.colliders.add_row(at.q)
+
+    @ti.func
+    def advance(self, at: ti.template()):
+        """Gather and move a particle."""
+        rate = at.particles.advance(at.g, self.device.groups[at.g], at.q, at.step.dt, self.gravity_of(at.step))
+        if rate > at.step.rate[at.g]:
+            ti.atomic_max(at.step.rate[at.g], rate)
+
+    # What is done beside the steps.
+
+    @ti.func
+    def average_for_frame(self, g: ti.template(), w: int, p: int, turn: ti.template()):
+        """Average volumes before a frame is read: clear the cell of a particle, add it, and take the mean."""
+        (run,) = ti.static((self.run(w),))
+        (view,) = ti.static(self.see(run))
+        if ti.static(turn == 0):
+            clear_mean(view.grid, g, view.groups[g], p)
+        if ti.static(turn == 1):
+            add_volume(view.grid, g, view.groups[g], p)
+        if ti.static(turn == 2):
+            view.groups[g].to_mean[p] = missing_to_mean(view.grid, g, view.groups[g], p)
+
+    @ti.func
+    def bin_of(self, g: ti.template(), w: int, p: int):
+        """Put a particle back into the domain where that repeats, and return its bin."""
+        (run,) = ti.static((self.run(w),))
+        (view,) = ti.static(self.see(run))
+        view.orders[g].wrap(p)
+        return view.orders[g].bin_of(p)
+
+    @ti.func
+    def first_node_of(self, g: ti.template(), w: int, p: int):
+        """Return the first node of the stencil of a particle."""
+        (run,) = ti.static((self.run(w),))
+        (view,) = ti.static(self.see(run))
+        return view.orders[g].first_node_of(p)
+
+    @ti.func
+    def nodes_in_use(self, w: int):
+        """Return the number of nodes in use, of those on the planes of faces, and of rows."""
+        (run,) = ti.static((self.run(w),))
+        (view,) = ti.static(self.see(run))
+        planes = 0
+        if ti.static(self.device.nodes.needs_contact or self.device.nodes.needs_friction):
+            planes = view.nodes.images.plane_nodes(view.grid)
+        return view.grid.box_nodes(), planes, view.grid.row_count()
+
 
 # Most steps of a launch, after which the host attends to the runs that need it.
 STEPS = 32
-# Of a step under way, per run: columns of float64.
-DT, SPLITS, DEFORMATION, WIDTH = range(4)
-# What phases run over beside particles: nodes in use, nodes on planes of faces, rows of nodes for each collider.
-OVER = ("nodes", "planes", "loads")
+# Parts of a step, a launch each: what shifts particles, in few steps; the phases until rigid bodies meet nodes, or all;
+# a round of that; and the rest.
+SHIFT, FIRST, ROUND, LAST = range(4)
+# What phases run over beside particles, see `Phase`.
+OVER = ("nodes", "planes", "rows", "loads", "bodies")
 
 
 @ti.data_oriented
@@ -49,22 +240,17 @@ class GpuLaunch:
 
     def __init__(self, device: Device, layout: Layout, *, doubles: bool) -> None:
         self.device, self.layout, self.doubles = device, layout, doubles
-        self.real, self.count = layout.real, layout.count
         self.dimension, self.runs, groups = device.grid.dimension, device.runs, device.groups
-        self.room, self.members = tuple(device.room), tuple(enumerate(groups))
-        self.phases, self.shifts = GpuPhases(device, layout), device.grid.fine is not None
-        drifts = device.particles.touches or not all(group.total for group in groups)
-        values = device.values if doubles else HostValues(device.values)
-        shift = farthest_shift(device.grid.fine)
-        self.steps = StepSize(layout, groups, values, device.grid.scheme, drifts=drifts, shift=shift)
+        self.capacity, self.members = tuple(device.capacity), tuple(enumerate(groups))
+        self.phases, self.shifts = GpuPhases(device, layout, doubles=doubles), device.grid.fine is not None
+        self.steps = StepSize.of(device, layout, device.values if doubles else HostValues(device.values))
         self.sorts, self.moved = device.sorts, sorted_fields(groups)
-        self.averages, self.moves = any(group.averaged for group in groups), device.motion is not None
-        self.loads = device.colliders.loads.rows * device.colliders.loads.room if device.nodes.collides else 0
+        self.rigid = device.rigid is not None
+        self.averages, self.moves = any(group.uses_f_bar for group in groups), device.motion is not None
+        self.loads = device.colliders.loads.rows * device.colliders.loads.capacity if device.nodes.collides else 0
         runs, widest = self.runs, max(entries(group) for group in groups)
-        self.counts = ti.field(ti.i32, shape=(runs, layout.counts))
-        self.numbers = double_field(runs, layout.reals) if doubles else None
-        self.under_way = double_field(runs, width=WIDTH) if doubles else None
-        self.limits, self.stepping, self.begun, self.sorting = (ti.field(int, shape=runs) for _ in range(4))
+        self.counts, self.numbers = self.phases.counts, self.phases.numbers
+        self.stepping, self.begun, self.sorting = (ti.field(int, shape=runs) for _ in range(3))
         self.active = ti.field(int, shape=(runs, len(groups)))
         self.reach = ti.field(int, shape=len(OVER))
         self.maxima = ti.field(float, shape=(runs, len(groups), widest))
@@ -75,167 +261,173 @@ class GpuLaunch:
     # A launch.
 
     def __call__(self, numbers: np.ndarray, counts: np.ndarray) -> None:
-        """Advance all runs; `numbers` and `counts` as of `run_numbers`."""
-        going = (counts[:, self.count.status] == GOING) & (counts[:, self.count.budget] > 0)
-        self._write_domains(numbers)
+        """Advance all runs; `numbers` and `counts` as of `Batch`."""
+        runs = self.phases.state(slice(None), numbers, counts)
+        going = (runs.status == GOING) & (runs.budget > 0)
+        self.phases.values.from_numpy(self._domains(runs))
         if going.any():
             if self.emission is not None:
-                self.emission.enter(numbers, counts, going)
+                self.emission.enter(runs, going)
             self.counts.from_numpy(counts)
-            self._sort_where_due(numbers, counts, going)
-            (self._take_steps if self.doubles else self._take_host_step)(numbers, counts, going)
+            self._sort_where_due(runs, counts, going)
+            (self._take_steps if self.doubles else self._take_host_step)(runs, numbers, counts, going)
         else:
             self.counts.from_numpy(counts)
-        self._measure(numbers, counts)
+        self._measure(runs)
 
-    def _write_domains(self, numbers: np.ndarray) -> None:
-        columns = [self.real.spacing, self.real.inverse_spacing, self.real.gradient_scale, *self.real.extent]
-        self.phases.domain.from_numpy(numbers[:, columns].astype(self.device.groups[0].real))
+    def _domains(self, runs: RunState) -> np.ndarray:
+        """Return the numbers of steps, see STEP, with those of the domains in them."""
+        values = np.zeros((self.runs, self.layout.widths["step"]), self.device.groups[0].real)
+        steps = self.phases.step_on_host(values)
+        steps.spacing, steps.inverse_spacing = runs.spacing, runs.inverse_spacing
+        steps.gradient_scale, steps.extent = runs.gradient_scale, np.stack(list(runs.extent), axis=1)
+        return values
 
-    def _take_steps(self, numbers: np.ndarray, counts: np.ndarray, going: np.ndarray) -> None:
+    def _take_steps(self, runs: RunState, numbers: np.ndarray, counts: np.ndarray, going: np.ndarray) -> None:
         """Take steps that the device chooses, until a run has to be sorted."""
         self.numbers.from_numpy(numbers)
-        room = numbers[going, self.real.drift_allowed] - numbers[going, self.real.drift]
-        steps = np.min(room / np.maximum(numbers[going, self.real.courant], 1e-3), initial=STEPS)
-        waited = counts[going, self.count.unrelaxed_steps]
-        for k in range(max(1, min(STEPS, int(steps), int(counts[going, self.count.budget].max())))):
-            if self.shifts and ((waited + k + 1) % INTERVAL == 0).any():
-                self.step(True)
-            self.step(False)
+        room = self.device.drift_allowed - runs.drift[going]
+        steps = np.min(room / np.maximum(runs.courant[going], 1e-3), initial=STEPS)
+        waited = runs.unrelaxed_steps[going].copy()
+        for k in range(max(1, min(STEPS, int(steps), int(runs.budget[going].max())))):
+            self._take_step(shifts=self.shifts and ((waited + k + 1) % INTERVAL == 0).any())
         numbers[:], counts[:] = self.numbers.to_numpy(), self.counts.to_numpy()
 
-    def _take_host_step(self, numbers: np.ndarray, counts: np.ndarray, going: np.ndarray) -> None:
+    def _take_host_step(self, runs: RunState, numbers: np.ndarray, counts: np.ndarray, going: np.ndarray) -> None:
         """Take a step that the host chooses."""
-        own, dimension = np.zeros((self.runs, PULL + self.dimension)), range(self.dimension)
-        stepping, taken = np.zeros(self.runs, np.int32), {}
+        stepping, values = np.zeros(self.runs, np.int32), self._domains(runs)
+        steps = self.phases.step_on_host(values)
         for w in np.flatnonzero(going).tolist():
-            dt, kick, splits, limit, deformation, stable = self.steps.begin(w, numbers, counts)
-            if dt > 0:
-                taken[w], stepping[w] = (dt, splits, limit, deformation), 1
-                own[w, [STEP, KICK, STABLE]] = dt, kick, stable
-                own[w, RELAXED] = self.steps.relaxed_in(w, dt, numbers, counts)
-                own[w, [PULL + a for a in dimension]] = [kick * numbers[w, self.real.gravity[a]] for a in dimension]
+            stepping[w] = self.steps.begin(self.phases.state(w, numbers, counts))
+        steps.dt, steps.kick, steps.relaxed, steps.stable = runs.dt, runs.kick, runs.relaxed, runs.stable
+        steps.gravity = np.stack([runs.kick * gravity for gravity in runs.gravity], axis=1)
         self.stepping.from_numpy(stepping)
-        self.phases.step.from_numpy(own.astype(self.device.groups[0].real))
-        if self.shifts and own[:, RELAXED].any():
-            self.step(True)
-        self.step(False)
-        speeds, lost = self.phases.speed_squared.to_numpy(), self.device.particles.lost.to_numpy()
-        rates, changes = self.phases.rates.to_numpy(), self.phases.changes.to_numpy()
-        for w, (dt, splits, limit, deformation) in taken.items():
-            rate = rates[w].astype(np.float64) + changes[w].astype(np.float64) / dt
-            numbers[w, list(self.real.rate)] = rate
-            sound = (lost.reshape(self.runs, -1)[w] == NOT_LOST).all()
-            speed = float(np.sqrt(speeds[w])) if sound else -1.0
-            self.steps.end(w, dt, splits, limit, deformation, speed, numbers, counts)
+        self.phases.values.from_numpy(values)
+        self._take_step(shifts=self.shifts and (runs.relaxed[stepping == 1] > 0).any())
+        steps = self.phases.step_on_host(self.phases.values.to_numpy())
+        lost = self.device.particles.lost.to_numpy().reshape(self.runs, -1)
+        for w in np.flatnonzero(stepping).tolist():
+            run = self.phases.state(w, numbers, counts)
+            for g, (rate, change) in enumerate(zip(steps.rate, steps.volume_change, strict=True)):
+                run.rate[g] = float(rate[w]) + float(change[w]) / run.dt
+            sound = (lost[w] == NOT_LOST).all()
+            self.steps.end(run, float(np.sqrt(steps.speed_squared[w])) if sound else -1.0)
+
+    def _take_step(self, *, shifts: bool) -> None:
+        """Take a step of every run that goes on, part by part; few steps shift particles before all else."""
+        if shifts:
+            self.step(SHIFT)
+        self.step(FIRST)
+        if self.rigid:
+            for _ in range(ROUNDS):
+                self.step(ROUND)
+            self.step(LAST)
+
+    def phases_of(self, part: int) -> list[tuple[Phase, int]]:
+        """Return the phases of a part of a step, with their turns."""
+        phases = self.device.phases
+        meet = next((k for k, phase in enumerate(phases) if phase.name == "meet"), len(phases))
+        own = {
+            SHIFT: [phase for phase in phases if phase.shifts],
+            FIRST: [phase for phase in phases[:meet] if not phase.shifts],
+            ROUND: phases[meet : meet + 1],
+            LAST: phases[meet + 1 :],
+        }
+        return [(phase, turn) for phase in own[part] for turn in range(2 if part == ROUND else phase.turns)]
 
     @ti.kernel
-    def step(self, shifts: ti.template()):
-        """Take a step of every run that goes on, or begin it and shift particles alone, which few steps do."""
-        for w in range(self.runs):
-            if ti.static(self.doubles):
-                if self.begun[w] == 0:
-                    self.begin(w)
-                self.begun[w] = ti.cast(shifts, int) * self.stepping[w]
-            self.prepare(w)
-        for phase, turn in ti.static(self.listed(shifts)):
+    def step(self, part: ti.template()):
+        """Carry out a part of a step of every run that goes on; the first one begins it, and the last one ends it."""
+        if ti.static(part in (SHIFT, FIRST)):
+            for w in range(self.runs):
+                if ti.static(self.doubles):
+                    if self.begun[w] == 0:
+                        self.begin(w)
+                    self.begun[w] = ti.static(int(part == SHIFT)) * self.stepping[w]
+                self.prepare(w, part)
+        for phase, turn in ti.static(self.phases_of(part)):
             if ti.static(phase.over != "particles"):
                 kind = ti.static(OVER.index(phase.over))
                 for q in range(self.runs * self.reach[kind]):
                     w = q // self.reach[kind]
                     if self.stepping[w] == 1:
-                        self.phases.do(phase, turn, w, q % self.reach[kind], self.counts)
+                        self.phases.do(phase, turn, w, q % self.reach[kind])
             if ti.static(phase.over == "particles"):
-                for p in range(self.runs * self.room[phase.group]):
-                    w = p // self.room[phase.group]
+                for p in range(self.runs * self.capacity[phase.group]):
+                    w = p // self.capacity[phase.group]
                     if self.stepping[w] == 1 and self.takes_part(phase.group, w, p):
-                        self.phases.do(phase, turn, w, p, self.counts)
-        if ti.static(self.doubles and not shifts):
+                        self.phases.do(phase, turn, w, p)
+        if ti.static(self.doubles and part == (LAST if self.rigid else FIRST)):
             for w in range(self.runs):
                 if self.stepping[w] == 1:
                     self.end(w)
 
-    def listed(self, shifts: bool) -> list[tuple[Phase, int]]:
-        """Return the phases that shift particles, or all others, with their turns."""
-        own = [phase for phase in self.device.phases if (phase.body is not None) == shifts]
-        return [(phase, turn) for phase in own for turn in range(phase.turns)]
-
     @ti.func
     def takes_part(self, g: ti.template(), w: int, p: int):
         """Return whether a particle of run w takes part; those that do come first."""
-        return p - w * ti.static(self.room[g]) < self.counts[w, self.count.particles[g]]
+        (run,) = ti.static((self.phases.run(w),))
+        return p - w * ti.static(self.capacity[g]) < run.particles[g]
 
     @ti.func
     def begin(self, w: int):
         """Choose the step of a run that goes on."""
         self.stepping[w] = 0
-        rests = self.numbers[w, self.real.drift] >= self.numbers[w, self.real.drift_allowed]
-        rests = rests or self.numbers[w, self.real.due] <= self.numbers[w, self.real.time]
-        if self.counts[w, self.count.status] == GOING and self.counts[w, self.count.budget] > 0 and not rests:
-            dt, kick, splits, limit, deformation, stable = self.steps.begin(w, self.numbers, self.counts)
-            if dt > 0:
+        (run,) = ti.static((self.phases.run(w),))
+        (step,) = ti.static((self.phases.step_of(w),))
+        rests = run.drift >= as_double(self.device.drift_allowed) or run.due <= run.time
+        if run.status == GOING and run.budget > 0 and not rests:
+            if self.steps.begin(run):
                 self.stepping[w] = 1
-                self.under_way[w] = ti.Vector([dt, splits, deformation])
-                self.limits[w] = limit
-                self.phases.step[w][STEP] = ti.cast(dt, float)
-                self.phases.step[w][KICK] = ti.cast(kick, float)
-                self.phases.step[w][STABLE] = ti.cast(stable, float)
-                relaxed = self.steps.relaxed_in(w, dt, self.numbers, self.counts)
-                self.phases.step[w][RELAXED] = ti.cast(relaxed, float)
+                step.dt = ti.cast(run.dt, float)
+                step.kick = ti.cast(run.kick, float)
+                step.stable = ti.cast(run.stable, float)
+                step.relaxed = ti.cast(run.relaxed, float)
                 for a in ti.static(range(self.dimension)):
-                    pull = ti.cast(self.numbers[w, self.real.gravity[a]], float)
-                    self.phases.step[w][PULL + a] = self.phases.step[w][KICK] * pull
+                    step.gravity[a] = step.kick * ti.cast(run.gravity[a], float)
                 if ti.static(self.moves):
-                    start = self.numbers[w, self.real.time]
-                    self.device.values.set_motions(w, self.device.motion, start, start + dt)
-                    self.device.motion.advance(w, dt)
+                    self.device.values.set_motions(w, self.device.motion, run.time, run.time + run.dt)
+                    self.device.motion.advance(w, run.dt)
 
     @ti.func
-    def prepare(self, w: int):
+    def prepare(self, w: int, part: ti.template()):
         """Begin the step of a run that was chosen."""
+        (step,) = ti.static((self.phases.step_of(w),))
         if self.stepping[w] == 1:
             if ti.static(self.device.values.gravity_varies):
-                pulled = self.device.gravity.in_step(self.phases.step[w][KICK], w)
+                pulled = self.device.gravity.in_step(step.kick, w)
                 for a in ti.static(range(self.dimension)):
-                    self.phases.step[w][PULL + a] = pulled[a]
+                    step.gravity[a] = pulled[a]
             if ti.static(self.device.grid.deterministic):
-                longest = ti.max(self.phases.step[w][KICK], self.phases.step[w][STABLE])
-                self.device.grid.fixed.set_step(w, longest)
-            self.phases.speed_squared[w] = 0.0
+                self.device.grid.fixed.set_step(w, ti.max(step.kick, step.stable))
+            step.speed_squared = 0.0
             for g in ti.static(range(len(self.members))):
                 # A law may have no particle yet.
-                self.phases.rates[w, g] = 0.0 if ti.static(self.device.comes_and_goes) else NOTHING
-                self.phases.changes[w, g] = 0.0
+                step.rate[g] = 0.0 if ti.static(self.device.comes_and_goes) else NOTHING
+                step.volume_change[g] = 0.0
+            if ti.static(part == FIRST and self.rigid):
+                (run,) = ti.static((self.phases.run(w),))
+                self.device.rigid.begin(w, run.dt, step.kick, self.phases.gravity_of(step))
 
     @ti.func
     def end(self, w: int):
         """Count the step of a run."""
-        speed, dt = ti.sqrt(self.phases.speed_squared[w]), self.under_way[w][DT]
-        for g in ti.static(range(len(self.members))):
-            # What the relaxation of volumes adds to the rate of deformation.
-            added = ti.cast(self.phases.changes[w, g], ti.f64) / dt
-            self.numbers[w, self.real.rate[g]] = ti.cast(self.phases.rates[w, g], ti.f64) + added
-            if self.device.particles.lost[w * ti.static(len(self.members)) + g] != NOT_LOST:
-                speed = -1.0
-        splits, deformation = self.under_way[w][SPLITS], self.under_way[w][DEFORMATION]
-        speed_64 = ti.cast(speed, ti.f64)
-        self.steps.end(w, dt, splits, self.limits[w], deformation, speed_64, self.numbers, self.counts)
+        (run,) = ti.static((self.phases.run(w),))
+        self.steps.end(run, self.phases.end_step(run))
 
     # Measurements of the state.
 
-    def _measure(self, numbers: np.ndarray, counts: np.ndarray) -> None:
+    def _measure(self, runs: RunState) -> None:
         """Store the maxima of each group of the runs that wait for them."""
-        waiting = np.isin(counts[:, self.count.status], (MEASURE, ATTEND))
+        waiting = np.isin(runs.status, (MEASURE, ATTEND))
         if not waiting.any():
             return
         self.sorting.from_numpy(waiting.astype(np.int32))
         self.find_maxima()
         maxima = self.maxima.to_numpy()
-        for w in np.flatnonzero(waiting):
-            counts[w, self.count.status] = ATTEND
-            for g, group in self.members:
-                first = self.real.maxima[g]
-                numbers[w, first : first + entries(group)] = maxima[w, g, : entries(group)]
+        runs.status[waiting] = ATTEND
+        for g, group in self.members:
+            for k in range(entries(group)):
+                runs.maxima[g][k][waiting] = maxima[waiting, g, k]
 
     @ti.kernel
     def find_maxima(self):
@@ -243,8 +435,8 @@ class GpuLaunch:
         for w, g, k in self.maxima:
             self.maxima[w, g, k] = NOTHING
         for g, group in ti.static(self.members):
-            for p in range(self.runs * self.room[g]):
-                w = p // self.room[g]
+            for p in range(self.runs * self.capacity[g]):
+                w = p // self.capacity[g]
                 if self.sorting[w] == 1 and self.takes_part(g, w, p):
                     own = ti.Vector([NOTHING] * ti.static(entries(group)))
                     v, C = group.motion(p)
@@ -256,9 +448,9 @@ class GpuLaunch:
 
     # Sorts.
 
-    def _sort_where_due(self, numbers: np.ndarray, counts: np.ndarray, going: np.ndarray) -> None:
+    def _sort_where_due(self, runs: RunState, counts: np.ndarray, going: np.ndarray) -> None:
         """Sort the particles of runs in which they have drifted, and find the nodes in use."""
-        due = going & (numbers[:, self.real.drift] >= numbers[:, self.real.drift_allowed])
+        due = going & (runs.drift >= self.device.drift_allowed)
         if not due.any():
             return
         self.sorting.from_numpy(due.astype(np.int32))
@@ -266,24 +458,27 @@ class GpuLaunch:
             for g in range(len(self.members)):
                 self.sort(g)
             if self.device.comes_and_goes:
-                counts[np.ix_(due, self.count.particles)] = self.active.to_numpy()[due]
+                active = self.active.to_numpy()
+                for g in range(len(self.members)):
+                    runs.particles[g][due] = active[due, g]
                 self.counts.from_numpy(counts)
         self.find_box()
-        numbers[due, self.real.drift] = 0.0
+        runs.drift[due] = 0.0
+        self.counts.from_numpy(counts)
 
     @ti.kernel
     def sort(self, g: ti.template()):
         """Sort the particles of a group by tile, in the runs that are marked."""
         order, buffers = ti.static((self.device.orders[g], self.device.orders[g].buffers))
-        bins, spans, room = ti.static((order.bins, order.spans, self.room[g]))
+        bins, spans, room = ti.static((order.bins, order.spans, self.capacity[g]))
         for q in range(self.runs * bins):
             if self.sorting[q // bins] == 1:
                 order.cursor[q, 0] = 0
         for p in range(self.runs * room):
             w = p // room
             if self.is_sorted(g, w, p):
-                place = self.phases.bin_of(g, w, p, self.counts)
-                buffers.key[w * buffers.room + p - w * room] = place
+                place = self.phases.bin_of(g, w, p)
+                buffers.key[w * buffers.capacity + p - w * room] = place
                 ti.atomic_add(order.cursor[w * bins + place, 0], 1)
         for s in range(self.runs * spans):
             total = 0
@@ -310,25 +505,32 @@ class GpuLaunch:
         for p in range(self.runs * room):
             w = p // room
             if self.is_sorted(g, w, p):
-                own = w * buffers.room - w * room
+                own = w * buffers.capacity - w * room
                 place = ti.atomic_add(order.cursor[w * bins + buffers.key[own + p], 0], 1)
                 buffers.order[own + place] = p
         for field in ti.static(self.moved[g]):
             for p in range(self.runs * room):
                 w = p // room
                 if self.is_sorted(g, w, p):
-                    keep(buffers, field, w * buffers.room, p - w * room, buffers.order[w * buffers.room + p - w * room])
+                    keep(
+                        buffers,
+                        field,
+                        w * buffers.capacity,
+                        p - w * room,
+                        buffers.order[w * buffers.capacity + p - w * room],
+                    )
             for p in range(self.runs * room):
                 w = p // room
                 if self.is_sorted(g, w, p):
-                    take(buffers, field, w * buffers.room, p - w * room, p)
+                    take(buffers, field, w * buffers.capacity, p - w * room, p)
         for w in range(self.runs):
             self.active[w, g] = order.start[w * (bins + 1) + ti.static(order.tiles)] - w * room
 
     @ti.func
     def is_sorted(self, g: ti.template(), w: int, p: int):
         """Return whether a particle is of a run that is marked."""
-        return self.sorting[w] == 1 and p - w * ti.static(self.room[g]) < self.counts[w, self.count.capacity[g]]
+        (run,) = ti.static((self.phases.run(w),))
+        return self.sorting[w] == 1 and p - w * ti.static(self.capacity[g]) < run.capacity[g]
 
     @ti.kernel
     def find_box(self):
@@ -337,10 +539,10 @@ class GpuLaunch:
             self.stencils[2 * w, a], self.stencils[2 * w + 1, a] = 2**30, -1
         if ti.static(self.sorts):
             for g, _group in ti.static(self.members):
-                for p in range(self.runs * self.room[g]):
-                    w = p // self.room[g]
+                for p in range(self.runs * self.capacity[g]):
+                    w = p // self.capacity[g]
                     if self.sorting[w] == 1 and self.takes_part(g, w, p):
-                        base = self.phases.first_node_of(g, w, p, self.counts)
+                        base = self.phases.first_node_of(g, w, p)
                         for a in ti.static(range(self.dimension)):
                             # The comparisons may be late, and save most atomics.
                             if base[a] < self.stencils[2 * w, a]:
@@ -349,8 +551,9 @@ class GpuLaunch:
                                 ti.atomic_max(self.stencils[2 * w + 1, a], base[a])
         for w in range(self.runs):
             if self.sorting[w] == 1:
+                (run,) = ti.static((self.phases.run(w),))
                 for a in ti.static(range(self.dimension)):
-                    last_wall = PAD + self.counts[w, self.count.cells[a]]
+                    last_wall = PAD + run.cells[a]
                     first, last = 0, last_wall + PAD
                     if ti.static(self.sorts):
                         low, high = self.stencils[2 * w, a], self.stencils[2 * w + 1, a]
@@ -361,20 +564,21 @@ class GpuLaunch:
                         first, last = box_of(self.device.grid, a, low, high, drift, last_wall)
                     self.device.grid.box[2 * w, a] = first
                     self.device.grid.box[2 * w + 1, a] = last - first + 1
-        for k in range(2):
+        for k in range(3):
             self.reach[k] = 0
-        self.reach[2] = self.loads
+        self.reach[3], self.reach[4] = self.loads, 1
         for w in range(self.runs):
-            nodes, planes = self.phases.nodes_in_use(w, self.counts)
+            nodes, planes, rows = self.phases.nodes_in_use(w)
             ti.atomic_max(self.reach[0], nodes)
             ti.atomic_max(self.reach[1], planes)
+            ti.atomic_max(self.reach[2], rows)
 
     # Frames.
 
     def begin_frame(self, numbers: np.ndarray, counts: np.ndarray) -> None:
         """Prepare the device for `read`."""
         if self.averages:
-            self._write_domains(numbers)
+            self.phases.values.from_numpy(self._domains(self.phases.state(slice(None), numbers, counts)))
             self.counts.from_numpy(counts)
             self.average_for_frame()
 
@@ -382,12 +586,12 @@ class GpuLaunch:
     def average_for_frame(self):
         """Average volumes over cells."""
         for g, group in ti.static(self.members):
-            if ti.static(group.averaged):
+            if ti.static(group.uses_f_bar):
                 for turn in ti.static(range(3)):
-                    for p in range(self.runs * self.room[g]):
-                        w = p // self.room[g]
+                    for p in range(self.runs * self.capacity[g]):
+                        w = p // self.capacity[g]
                         if self.takes_part(g, w, p):
-                            self.phases.average_for_frame(g, w, p, turn, self.counts)
+                            self.phases.average_for_frame(g, w, p, turn)
 
     def _reader(self, g: int) -> Callable[..., None]:
         """Return the kernel that writes what particles of a group show."""
@@ -403,17 +607,17 @@ class GpuLaunch:
             gradient: int,
             tau: int,
             activity: int,
-            shown: ti.types.ndarray(ndim=2),
+            frame_buffer: ti.types.ndarray(ndim=2),
         ):
             for chunk in range((count + LANES - 1) // LANES):
                 begin, own = first + chunk * LANES, ti.min(LANES, count - chunk * LANES)
                 (seen,) = ti.static((group.seen_from(run),))
-                show_range(seen, begin, own, dt, 0, affine, gradient, tau, activity, shown, None, 0)
+                show_range(seen, begin, own, dt, 0, affine, gradient, tau, activity, frame_buffer, None, 0)
 
         return show
 
     def read(
-        self, g: int, run: int, first: int, count: int, dt: float, columns: FrameColumns, shown: np.ndarray
+        self, g: int, run: int, first: int, count: int, dt: float, columns: FrameColumns, frame_buffer: np.ndarray
     ) -> None:
         """Write what particles of the g-th group of a run show into the rows of their numbers, (n, columns)."""
-        self.readers[g](run, first, count, dt, *chosen_columns(columns), shown)
+        self.readers[g](run, first, count, dt, *chosen_columns(columns), frame_buffer)

@@ -24,8 +24,8 @@ import psutil
 
 from mpmcli.quick_taichi import ti
 from mpmcli.solver.engine.compiled_kind import CompiledKind
-from mpmcli.solver.engine.cpu_launch import CpuLaunch, Notes
-from mpmcli.solver.engine.cpu_phases import RunInts, RunReals, Shown
+from mpmcli.solver.engine.cpu_launch import CpuLaunch, FrameStats
+from mpmcli.solver.engine.cpu_phases import FrameBuffer, RunInts, RunReals
 from mpmcli.solver.machine.backend import Backend, after_stop
 
 # Versions of Taichi whose files test_kernel_store.py has been run with.
@@ -40,7 +40,7 @@ SOURCES = ("scene", "frames", "stability", "materials", "boundaries", "solver")
 PROSE = re.compile(rb'^ *""".*?"""\n|^ *#[^\n]*\n', re.MULTILINE | re.DOTALL)
 # Clocks of a file system and of this machine differ by less, s.
 CLOCKS = 2.0
-# What the stub leaves in notes[0, 0, 0], which is never negative otherwise.
+# What the stub leaves in frame_stats[0, 0, 0], which is never negative otherwise.
 MARK = -(2**30)
 # Where this variable is "off", kernels are neither stored nor found: for who changes modules while they run.
 SWITCH = "MPMCLI_KERNEL_STORE"
@@ -59,27 +59,31 @@ class StoredLaunch:
         self._kernel: Callable[..., None] | None = None
         self.stored = False
 
-    def __call__(self, numbers: np.ndarray, counts: np.ndarray, shown: np.ndarray, notes: np.ndarray) -> None:
+    def __call__(
+        self, numbers: np.ndarray, counts: np.ndarray, frame_buffer: np.ndarray, frame_stats: np.ndarray
+    ) -> None:
         if self._kernel is None:
-            self._first(numbers, counts, shown, notes)
+            self._first(numbers, counts, frame_buffer, frame_stats)
         else:
-            self._kernel(numbers, counts, shown, notes)
+            self._kernel(numbers, counts, frame_buffer, frame_stats)
 
-    def _first(self, numbers: np.ndarray, counts: np.ndarray, shown: np.ndarray, notes: np.ndarray) -> None:
+    def _first(
+        self, numbers: np.ndarray, counts: np.ndarray, frame_buffer: np.ndarray, frame_stats: np.ndarray
+    ) -> None:
         key = ""
         if self._may_store():
             key = kernel_key(self._kind, self._backend, self._launch.device.runs)
-            stub, noted = stub_kernel(key), notes[0, 0, 0]
-            stub(numbers, counts, shown, notes)
-            if notes[0, 0, 0] != MARK:
+            stub, noted = stub_kernel(key), frame_stats[0, 0, 0]
+            stub(numbers, counts, frame_buffer, frame_stats)
+            if frame_stats[0, 0, 0] != MARK:
                 self._kernel, self.stored = stub, True
                 return
-            notes[0, 0, 0] = noted
+            frame_stats[0, 0, 0] = noted
             self._launch.token = words_of(key)
             _compiled[key] = Path(ti.lang.impl.current_cfg().offline_cache_file_path), time.time()
             after_stop(store_compiled)
         with _named(CpuLaunch.launch._primal.func, f"launch_{key}" if key else "launch"):
-            self._launch.launch(numbers, counts, shown, notes)
+            self._launch.launch(numbers, counts, frame_buffer, frame_stats)
         self._kernel = self._launch.launch
 
     def _may_store(self) -> bool:
@@ -108,10 +112,10 @@ def stub_kernel(key: str) -> Callable[..., None]:
     """Return the stub of a key; each key makes another kernel for Taichi."""
     words = words_of(key)
 
-    def stub(numbers: RunReals, counts: RunInts, shown: Shown, notes: Notes):
+    def stub(numbers: RunReals, counts: RunInts, frame_buffer: FrameBuffer, frame_stats: FrameStats):
         for word in ti.static(words):
-            notes[0, 0, 0] = word
-        notes[0, 0, 0] = MARK
+            frame_stats[0, 0, 0] = word
+        frame_stats[0, 0, 0] = MARK
 
     stub.__name__ = f"stub_{key}"
     return ti.kernel(stub)

@@ -1,23 +1,237 @@
-"""A run of a batch frame by frame."""
+"""A run: a scene in one place of a batch, from its particles at time 0 to its last frame."""
 
+import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property, partial
 
 import numpy as np
 
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
-from mpmcli.solver.engine.failure import stop
-from mpmcli.solver.engine.stepped_run import SteppedRun
-from mpmcli.solver.frames.builder import Moment
+from mpmcli.scene import BodyParticles, Scene, estimate_particles, sample_bodies
+from mpmcli.solver.contact.layers import require_contact_possible
+from mpmcli.solver.drive.expressions import RunValues
+from mpmcli.solver.drive.forces import Drives, ExternalForces
+from mpmcli.solver.engine.batch import Batch
+from mpmcli.solver.engine.compiled_kind import CompiledKind
+from mpmcli.solver.engine.emission import begin_emission
+from mpmcli.solver.engine.run_group import RunGroup, groups_of, require_inside
+from mpmcli.solver.engine.run_state import (
+    ATTEND,
+    BEYOND,
+    COLLAPSED,
+    CROWDED,
+    GOING,
+    IDLE,
+    LIMITS,
+    LOST,
+    MEASURE,
+    RunState,
+)
+from mpmcli.solver.engine.saved_state import SavedState, read_batch, write_batch
+from mpmcli.solver.engine.step_size import StepControl
+from mpmcli.solver.frames.builder import NO_STEPS, FrameBuilder, StepsTaken, Sums, sums_of_rows
 from mpmcli.solver.frames.columns import FrameArrays
-from mpmcli.solver.frames.ledger_sums import NO_STEPS, StepsTaken, Sums, sums_of_rows
-from mpmcli.solver.frames.recorder import steps_of
-from mpmcli.solver.transfer.particle_update import SMALLEST_J
+from mpmcli.solver.frames.diagnosis import require_sums_hold, stop, stop_collapsed
+from mpmcli.solver.frames.recorder import FrameRecorder, moment_of, steps_of
+from mpmcli.solver.grid.sparse_grid import WANTED, first_nodes_of
+from mpmcli.solver.machine.backend import Arch, Backend, choose_backend
+from mpmcli.solver.machine.plan import cheapest, useful_threads
+from mpmcli.solver.particles.state_bounds import StateBounds, state_bounds_of
+from mpmcli.solver.transfer.particle_update import NOT_LOST, SMALLEST_J
+from mpmcli.stability.limits import Limit, collider_limit, force_limit
+
+# Particle-steps of the first launch, wall time of the others, s, and the growth from one to the next. The bytes of a
+# run depend on none of them.
+FIRST, LAUNCH, GROWTH = 1_000_000, 0.4, 4
 
 
-class Run(SteppedRun):
-    """A scene in one place of a batch; of several runs of a batch only `events` may be used."""
+class LaunchBudget:
+    """How many `steps` a run may take in the next launch: its host may stop it within some tenths of a second."""
+
+    def __init__(self, particles: int) -> None:
+        self.steps = max(1, FIRST // particles)
+
+    def took(self, steps: int, seconds: float) -> None:
+        """Take note of the last launch: its steps, and its wall time, s."""
+        if steps > 0 and seconds > 0:
+            self.steps = max(1, min(GROWTH * self.steps, int(LAUNCH * steps / seconds)))
+
+
+class Run:
+    """A scene in one place of a batch.
+
+    `frames` computes a run that is alone in its batch, `frames_of_all` several runs of a batch. What reads or steps a
+    run in other ways launches its batch, and may not be used for several.
+
+    Attributes:
+        scene: what is computed.
+        batch, slot: where.
+        groups: the particles, a group for each law.
+        particle_count: number of particles.
+        first_step_seconds: wall time of the first launch, which compiles the kernels; 0 before it.
+        frame_seconds, frame_processor_seconds: wall and processor time spent so far on frames and ledger rows.
+    """
+
+    def __init__(
+        self,
+        batch: Batch,
+        slot: int,
+        scene: Scene,
+        particles: list[BodyParticles] | None = None,
+        *,
+        force: bool = False,
+    ) -> None:
+        """Fill the place.
+
+        Args:
+            slot: number of the place, whose last run has ended.
+            particles: one entry per body, in place of the scene's own sampling.
+            force: take time.step as it is, above the stable step too.
+
+        Raises:
+            InputError: a particle is not in the domain.
+        """
+        self.scene, self.batch, self.slot, self.backend = scene, batch, slot, batch.backend
+        self.forced = force and scene.time.step != "auto"
+        self.first_step_seconds = self.frame_seconds = self.frame_processor_seconds = 0.0
+        self.spacing = scene.domain.spacing
+        self._particles = particles or sample_bodies(scene)
+        self._counts_of_sources = [len(b.position) for b in self._particles]
+        self.particle_count = sum(self._counts_of_sources)
+        require_inside(scene, self._particles)
+        self._state = batch.state(slot)
+        self.groups: list[RunGroup] = groups_of(batch, slot, scene, self._particles)
+        self._budget = LaunchBudget(self.particle_count)
+        self._recorder = FrameRecorder(batch, slot, self.particle_count, scene.time.frames)
+        self._place()
+        if batch.device.grid.sparse:
+            batch.occupy(first_nodes_of(np.concatenate([body.position for body in self._particles]), scene))
+        # Frames keep what they show of the particles at the start, which are on the device.
+        _ = self._builder
+        self._particles = []
+
+    def _place(self) -> None:
+        """Write what belongs to the scene, and let the next launch measure the state at time 0."""
+        scene, batch, state = self.scene, self.batch, self._state
+        drives = Drives.of(scene, [group.bodies for group in self.groups])[1]
+        end = scene.time.end
+        self._values = RunValues(batch.values.device, self.slot, drives, end / scene.time.frames, end)
+        batch.values.of_runs[self.slot] = self._values
+        self._tables, self._means = batch.values.tables, list(self._values.means.values())
+        self._filled_since, self._coarse = -math.inf, False
+        state.reset()
+        self._write_scene()
+        state.status, state.horizon = MEASURE, math.inf if self._tables is None else -math.inf
+        self._begun = self._resumed = False
+
+    def _write_scene(self) -> None:
+        """Write what does not change during a run: domain, walls, colliders, emitters and bounds on the step."""
+        scene, device, state = self.scene, self.batch.device, self._state
+        walls, colliders = (device.friction, device.moving, device.grid.period), (device.colliders, device.motion)
+        for data in (*walls, *colliders, device.rigid, device.rigid_contact, device.contact):
+            if data is not None:
+                data.write(scene, self.slot)
+        h = scene.domain.spacing
+        state.spacing, state.inverse_spacing = h, 1 / h
+        state.gradient_scale = device.grid.scheme.spline.inverse_moment / h
+        state.cells, state.extent = scene.domain.cells, [n * h for n in scene.domain.cells]
+        state.gravity, state.wall_speed = scene.domain.gravity_at(0.0), scene.domain.wall_speed
+        state.end, state.frames, state.safety = scene.time.end, scene.time.frames, scene.time.safety
+        state.maximum, state.forced = math.inf if scene.time.step == "auto" else scene.time.step, self.forced
+        speeds = [each.fastest(scene.domain, scene.time.end) for each in scene.colliders if not each.free]
+        state.collider = collider_limit(h, max(speeds, default=0.0))
+        for g, group in enumerate(self.groups):
+            state.sensitivity[g], state.hardening[g] = group.law.sensitivity, group.law.hardening
+        begin_emission(self.batch, self.slot, scene, self._counts_of_sources)
+
+    # What a run is, and how far it has come.
+
+    @cached_property
+    def _builder(self) -> FrameBuilder:
+        # Where the host forms the sums of the ledger it needs all that is summed.
+        columns = () if self.backend.on_cpu else ("affine", "deformation_gradient")
+        return FrameBuilder(self.scene, self._particles, self.groups, columns)
+
+    @property
+    def laws(self) -> tuple[str, ...]:
+        """Names of the laws, in the order of `Frame.material`."""
+        return tuple(group.law.name for group in self.groups)
+
+    @property
+    def grid(self) -> object:
+        """The nodes of the batch, see `Grid`."""
+        return self.batch.device.grid
+
+    @property
+    def state(self) -> RunState:
+        """The numbers of the run, once it has begun; what is written there counts from the next step on."""
+        self.begin()
+        return self._state
+
+    @property
+    def time(self) -> float:
+        """Time of the state, s, in double precision."""
+        return self._state.time
+
+    @property
+    def step_count(self) -> int:
+        """Steps taken."""
+        return int(self._state.step_count)
+
+    @property
+    def last_step(self) -> float:
+        """Size of the last step, s, 0 before the first."""
+        return self._state.last_step
+
+    @property
+    def courant(self) -> float:
+        """Cells that the fastest node moved in the last step, which no particle exceeds."""
+        return self._state.courant
+
+    @property
+    def measure_seconds(self) -> float:
+        """Wall time spent so far on the limits that follow from measurements of the state, s."""
+        return self._control.seconds if self._begun else 0.0
+
+    # The time step.
+
+    def limits(self) -> list[Limit]:
+        """Return every bound on the next step: of the speed as it is, of the rest as last measured."""
+        state, limits = self.state, self._control.limits()
+        value = min(min(limit.value for limit in limits), state.held)
+        limits.append(Limit(self.batch.steps.speed_limit(state, value), "speed", ""))
+        if self._forces.pushes:
+            limits.append(Limit(state.force, "force", ""))
+        if self.scene.colliders:
+            limits.append(Limit(state.collider, "collider", ""))
+        return limits
+
+    def limits_now(self) -> list[Limit]:
+        """Return every bound that follows from the state of the particles as it is, without storing it."""
+        self.begin()
+        self._launch_alone(status=MEASURE, arrived=0)
+        return self._control.limits_now()
+
+    @property
+    def nearest_limit(self) -> Limit:
+        """The smallest bound on the next step."""
+        return self._limit(*self.batch.steps.nearest(self.state))
+
+    def stable_step(self) -> tuple[float, Limit]:
+        """Return the step to take, safety included, and the bound that sets it."""
+        step, code = self.batch.steps.stable_step(self.state)
+        chosen = LIMITS[code] in ("maximum", "forced")
+        return step, self._limit(step, code) if chosen else self.nearest_limit
+
+    def _limit(self, value: float, code: int) -> Limit:
+        """Return a bound of `StepSize`."""
+        by_stiffness = LIMITS[code] == self._control.stiffest.name
+        return Limit(value, LIMITS[code], self._control.stiffest.body if by_stiffness else "")
+
+    # Frames.
 
     def frames(self, stop: Callable[[], bool] = lambda: False) -> Iterator[tuple[Frame, LedgerRow]]:
         """Yield the state as it is and then one frame for each output time to come, with its ledger row.
@@ -32,62 +246,92 @@ class Run(SteppedRun):
             UnstableRunError: a particle left the domain, was inverted or became non-finite.
             KeyboardInterrupt: `stop` returned True.
         """
-        for event in self.events():
-            if event is not None:
-                yield event
-                continue
+        yield from self.begin_frames()
+        while not self.ended:
             # Frame 0 is always there, and what a launch has recorded is yielded before.
             if self._begun and stop():
                 raise KeyboardInterrupt
+            self.before_launch()
             self.batch.launch()
-            self.first_step_seconds = self.first_step_seconds or self.batch.first_seconds
+            yield from self.after_launch()
 
-    def events(self) -> Iterator[tuple[Frame, LedgerRow] | None]:
-        """Yield as `frames` does, and None where the batch must launch."""
-        if self.backend.on_cpu:
-            yield from self._recorded_events()
-            return
-        if not self._begun:
-            yield None
-            self._start()
+    def begin_frames(self) -> Iterator[tuple[Frame, LedgerRow]]:
+        """Yield the state as it is, unless it is not known before a launch, or was loaded between frames."""
         resumed, self._resumed = self._resumed, False
-        if not resumed:
+        if self._begun and not resumed:
             yield self.frame()
-            self._recorder.index, self._recorder.steps = self._next_frame(), self.step_count
-        count = self.scene.time.frames
-        while (index := self._recorder.index) <= count:
-            for _ in self._reach(self.scene.time.end * index / count, anew=not resumed):
-                yield None
-            resumed = False
+            self._recorder.index, self._recorder.steps = 1, self.step_count
+            while not self.ended and self._time_of(self._recorder.index) <= self.time:
+                self._recorder.index += 1
+            self._aim()
+        if self.backend.on_cpu and not resumed:
+            self._recorder.start(self._builder.columns)
+            self._state.arrived = not self._begun or self.ended
+
+    @property
+    def ended(self) -> bool:
+        """Whether the last frame was yielded."""
+        return self._begun and self._recorder.index > self.scene.time.frames
+
+    def before_launch(self) -> None:
+        """Let the next launch advance the run; the first one measures it, and shows what it begins with."""
+        if self._begun:
+            self._state.status, self._state.budget = GOING, self._budget.steps
+        if self._state.records:
+            self._recorder.reserve()
+        self._launched = self.batch.seconds, self.step_count
+
+    def after_launch(self) -> Iterator[tuple[Frame, LedgerRow]]:
+        """Yield the frames that a launch has reached, and do what it asks for."""
+        if not self._begun:
+            self._start()
+            if self.backend.on_cpu:
+                yield from self._recorded()
+                if self._state.recorded == 0:
+                    stop(self, 0.0)
+            else:
+                yield self.frame()
+                self._recorder.index = 1
+                self._aim()
+            return
+        self._note_launch()
+        if self._state.records:
+            yield from self._recorded()
+        self._attend()
+        if not self.backend.on_cpu and self._state.arrived:
             # A particle that the last step has inverted would be found in the next one only.
-            if not self._state.step_control.sound():
+            if not self._control.sound():
                 stop(self, self.last_step)
-            taken = steps_of(self._row, self.step_count - self._recorder.steps)
+            index, taken = self._recorder.index, steps_of(self._state, self.step_count - self._recorder.steps)
             self._recorder.index, self._recorder.steps = index + 1, self.step_count
+            self._aim()
             yield self.frame(index, taken)
 
-    def _recorded_events(self) -> Iterator[tuple[Frame, LedgerRow] | None]:
-        """Yield as `events` on the CPU, where the kernel records frames while it goes on."""
-        if not self._begun:
-            self._recorder.begin(self._builder.columns)
-            yield None
-            self._start()
-            yield from self.recorded(0)
-            if self._row.count("recorded") == 0:
-                stop(self, 0.0)
-        elif not self._resumed:
-            yield self.frame()
-            self._recorder.go_on(self._builder.columns, self._next_frame(), self.step_count)
-            self._exchange.push(self._state)
-        self._resumed = False
-        yield from self._advance()
+    def _time_of(self, index: int) -> float:
+        """Return the time of a frame, s."""
+        return self.scene.time.end * index / self.scene.time.frames
 
-    def _next_frame(self) -> int:
-        """Return the number of the first frame after the time of the state."""
-        count, index = self.scene.time.frames, 1
-        while index <= count and self.scene.time.end * index / count <= self.time:
-            index += 1
-        return index
+    def _aim(self, *, anew: bool = True) -> None:
+        """Let the run go on to the time of the next frame, and begin to record steps for it where that is `anew`."""
+        state = self._state
+        state.frame = min(self._recorder.index, self.scene.time.frames)
+        state.target = self._time_of(state.frame)
+        if anew:
+            self.batch.steps.forget_steps(state)
+
+    def _note_launch(self) -> None:
+        """Take note of how long the last launch took."""
+        seconds, steps = self._launched
+        self._budget.took(self.step_count - steps, self.batch.seconds - seconds)
+        self.first_step_seconds = self.first_step_seconds or self.batch.first_seconds
+
+    def _recorded(self) -> Iterator[tuple[Frame, LedgerRow]]:
+        """Yield the frames that the last launch has recorded."""
+        began, processor_began = time.perf_counter(), time.process_time()
+        built = self._recorder.read(self._builder)
+        self.frame_seconds += time.perf_counter() - began
+        self.frame_processor_seconds += time.process_time() - processor_began
+        yield from built
 
     def frame(self, index: int = 0, taken: StepsTaken = NO_STEPS) -> tuple[Frame, LedgerRow]:
         """Return the state as a frame, and the ledger row for the steps taken.
@@ -99,9 +343,7 @@ class Run(SteppedRun):
         began, processor_began = time.perf_counter(), time.process_time()
         arrays = FrameArrays(columns, np.empty((1, self.particle_count, columns.count), self.groups[0].real))
         sums, loads = self._read(arrays)
-        blocked = self._row.count("blocked")
-        moment = Moment(index, state.time, state.step_count, state.last_step, taken, loads, blocked)
-        (built,) = self._builder.build([moment], arrays, sums)
+        (built,) = self._builder.build([moment_of(state, index, taken, loads)], arrays, sums)
         self.frame_seconds += time.perf_counter() - began
         self.frame_processor_seconds += time.process_time() - processor_began
         return built
@@ -116,6 +358,9 @@ class Run(SteppedRun):
         else:
             if colliders is not None:
                 loads["collider"] = colliders.loads.read(self.slot, len(self.scene.colliders))
+            if (rigid := self.batch.device.rigid) is not None:
+                loads["rigid"], taken = rigid.read(self.slot)
+                loads["collider"][list(rigid.free)] += taken
             gpu = self.batch.gpu
             gpu.begin_frame(self.batch.numbers, self.batch.counts)
             for g, group in enumerate(self.groups):
@@ -126,3 +371,291 @@ class Run(SteppedRun):
         if not sound:
             stop(self, self.last_step)
         return sums, loads
+
+    # Beginning, and steps from outside.
+
+    def begin(self) -> None:
+        """Take the bounds of time 0; a second call does nothing."""
+        if not self._begun:
+            self.batch.launch()
+            self._start()
+
+    def restart(self) -> None:
+        """Begin anew at time 0 with the particles as they are on the device, set from outside."""
+        self._forget_lost()
+        self._place()
+        self._recorder.index, self._builder.before = 0, 0.0
+        self.begin()
+
+    def _start(self) -> None:
+        """Take the bounds of time 0 from the measurement of the first launch."""
+        self.first_step_seconds = self.batch.first_seconds
+        self._follow()
+        self._control.begin()
+        free = [each.fastest(self.scene.domain, 0.0) for each in self.scene.colliders if each.free]
+        self._state.speed = max([self._control.speed, *free])
+        self._measure_forces(0.0)
+        # Once more, with the step that says how far ahead the next measurement is.
+        self._measure_forces(self.stable_step()[0])
+        self._state.first_stable_step = self.stable_step()[0]
+
+    def _follow(self) -> None:
+        """Begin to follow the state from the measurement that the kernel made last."""
+        measured = [partial(self._measured, g) for g in range(len(self.groups))]
+        self._control = StepControl(self.scene, self.groups, self._state, measured)
+        measures = [
+            partial(push, group.first, group.count, self.slot)
+            for push, group in zip(self.batch.pushes, self.groups, strict=True)
+            if push is not None
+        ]
+        self._forces = ExternalForces(self._values, measures)
+        self._begun = True
+
+    def _measured(self, g: int) -> StateBounds:
+        """Return the bounds of the state of the g-th group as the kernel has measured them last."""
+        return state_bounds_of(self.groups[g], list(self._state.maxima[g]))
+
+    def step(self, dt: float, until: float | None = None) -> None:
+        """Advance by dt (s), whatever the bounds on the step.
+
+        Args:
+            until: the time after the step where that is known, s; a sum has rounding errors.
+
+        Raises:
+            UnstableRunError: a particle left the domain, was inverted or became non-finite.
+        """
+        self.state.given = dt
+        try:
+            self._reach(self.time + dt if until is None else until)
+        finally:
+            self._state.given = 0.0
+
+    def advance(self, count: int) -> tuple[int, float]:
+        """Take about `count` stable steps, whatever the times of frames are, for a measurement of speed.
+
+        Returns:
+            The number of steps taken, and the smallest one, s.
+
+        Raises:
+            UnstableRunError: a particle left the domain, was inverted or became non-finite.
+        """
+        step = min(self.stable_step()[0], self._time_of(1))
+        before = self.step_count
+        self._reach(self.time + count * step)
+        return self.step_count - before, self._state.smallest
+
+    def _reach(self, target: float) -> None:
+        """Launch the batch until the run has reached a time, s."""
+        state = self._state
+        state.target, state.records = target, 0
+        self.batch.steps.forget_steps(state)
+        while not state.arrived:
+            self.before_launch()
+            self.batch.launch()
+            self._note_launch()
+            self._attend()
+
+    def measure(self) -> None:
+        """Measure the state of all particles, and take the limits that follow."""
+        self.begin()
+        self._launch_alone(status=MEASURE, arrived=0)
+        self._measure(range(len(self.groups)))
+
+    def state_was_replaced(self) -> None:
+        """Sort and measure particles whose state was set from outside; none of them counts as lost."""
+        self._forget_lost()
+        self.state.drift = math.inf
+        self.measure()
+
+    def _launch_alone(self, **counts: int) -> None:
+        """Launch with these counts, and leave all numbers as they were but what was measured."""
+        numbers, before = self.batch.numbers.copy(), self.batch.counts.copy()
+        self.batch.state(slice(None)).status = IDLE
+        for name, value in counts.items():
+            setattr(self._state, name, value)
+        try:
+            self.batch.launch()
+        finally:
+            measured = [list(maxima) for maxima in self._state.maxima]
+            self.batch.numbers[:], self.batch.counts[:] = numbers, before
+            for g, maxima in enumerate(measured):
+                self._state.maxima[g] = maxima
+
+    # What the host does between launches.
+
+    def _attend(self) -> None:
+        """Do what the status asks for after a launch."""
+        status = self._state.status
+        if status in (LOST, COLLAPSED):
+            self._state.status = IDLE
+        if status == LOST:
+            stop(self, self.last_step)
+        if self.grid.deterministic:
+            require_sums_hold(self)
+        if status == COLLAPSED:
+            stop_collapsed(self, self.stable_step()[0])
+        if status == BEYOND:
+            self._fill_tables()
+        if status == CROWDED:
+            self.batch.grow(self.batch.device.grid.sizes[WANTED])
+        if status == ATTEND and (due := self._control.due()):
+            self._measure(due)
+
+    def _measure(self, due: Sequence[int]) -> None:
+        """Take the measurement of some groups that the kernel has made after the last step."""
+        if not self._control.measure(due):
+            stop(self, self.last_step)
+        self._measure_forces(self.last_step)
+        if self._control.fresh:
+            self._state.speed = self._control.speed
+
+    def _measure_forces(self, step: float) -> None:
+        """Measure forces up to the next measurement, which is so many steps (s) ahead at most."""
+        state, forces = self._state, self._forces
+        push, slope = forces.measure(state.time, state.longest * step)
+        gravity = self.scene.domain.gravity_at(0.0) if self.scene.domain.steady else [0.0]
+        state.pull = float(np.linalg.norm(gravity)) + push
+        if forces.pushes:
+            state.force = force_limit(slope)
+
+    def _fill_tables(self) -> None:
+        """Let the kernel go on from the time that velocities have."""
+        since = self._state.velocity_time
+        # The same time again: the next kick takes more windows than found room.
+        self._coarse, self._filled_since = since == self._filled_since, since
+        self._state.horizon = self._tables.fill(self.slot, self._means, since, coarse=self._coarse)
+
+    # States.
+
+    def save(self) -> SavedState:
+        """Return the state of the only run of a batch, where `stop` of `frames` is called, or between steps.
+
+        Its arrays are copied from the device one by one as they are asked for, which is over when the next step begins.
+        """
+        self.begin()
+        numbers = {
+            "step_control": self._control.save(),
+            "tables": [self._filled_since, self._coarse],
+            "frames": [self._recorder.index, self._recorder.steps, self._builder.before],
+        }
+        return SavedState(numbers, read_batch(self.batch))
+
+    def load(self, saved: SavedState) -> None:
+        """Go on from a saved state of the same scene, or of one that ends earlier, as the only run of a batch.
+
+        Raises:
+            InputError: it is of another scene, or of another kind of backend.
+        """
+        write_batch(self.batch, saved.arrays)
+        self._forget_lost()
+        self._follow()
+        self._control.load(saved.numbers["step_control"])
+        self._filled_since, self._coarse = saved.numbers["tables"]
+        if math.isfinite(self._filled_since):
+            self._tables.fill(self.slot, self._means, self._filled_since, coarse=self._coarse)
+        self._recorder.index, self._recorder.steps, self._builder.before = saved.numbers["frames"]
+        self._resumed = self._recorder.index > 0
+        if not self.backend.on_cpu:
+            # There particles are sorted anew.
+            self._state.drift = math.inf
+        elif self._resumed:
+            self._recorder.start(self._builder.columns)
+        if self._resumed:
+            self._aim(anew=self._state.arrived == 1 and not self.ended)
+
+    # How a run ends before its time.
+
+    def _forget_lost(self) -> None:
+        """Let no particle count as lost."""
+        lost, first = self.batch.device.particles.lost, self.slot * len(self.groups)
+        for g in range(len(self.groups)):
+            lost[first + g] = NOT_LOST
+        if self.grid.deterministic:
+            self.grid.fixed.forget(self.slot)
+
+    def lost(self) -> list[int | None]:
+        """Return a lost particle of each group, in solver order, None where none is known."""
+        count = len(self.groups)
+        found = self.batch.device.particles.lost.to_numpy()[self.slot * count :][:count]
+        if self.grid.deterministic:
+            # There it is the id, as the order depends on atomics.
+            rows = [np.flatnonzero(group.read()["id"] == p) for group, p in zip(self.groups, found, strict=True)]
+            return [int(p[0]) if len(p) else None for p in rows]
+        return [None if p == NOT_LOST else int(p) - group.first for p, group in zip(found, self.groups, strict=True)]
+
+
+def frames_of_all(runs: Mapping[int, Run]) -> Iterator[tuple[int, tuple[Frame, LedgerRow] | Exception | None]]:
+    """Yield the frames of runs that share a batch as they come, each with the key of its run.
+
+    None follows on the last one of a run, or the error that ended it.
+    """
+    going = dict(runs)
+    for key, run in runs.items():
+        yield from ((key, event) for event in run.begin_frames())
+    while going:
+        try:
+            for run in going.values():
+                run.before_launch()
+            next(iter(going.values())).batch.launch()
+        except Exception as error:
+            yield from ((key, error) for key in going)
+            return
+        for key, run in list(going.items()):
+            try:
+                yield from ((key, event) for event in run.after_launch())
+            except Exception as error:
+                del going[key]
+                yield key, error
+            if key in going and run.ended:
+                del going[key]
+                yield key, None
+
+
+# On a GPU, where runs advance at once.
+FEW_ON_GPU = 100_000
+
+
+def backend_for(
+    scene: Scene,
+    expected_steps: Callable[[], int],
+    arch: Arch = "auto",
+    threads: int | None = None,
+    *,
+    compile_cache: bool = True,
+) -> Backend:
+    """Return the backend for a scene, not started.
+
+    Args:
+        expected_steps: their number; called on the CPU only.
+        threads: CPU threads; None for as many as the scene has use for.
+
+    Raises:
+        InputError: the backend cannot be used.
+    """
+    backend = choose_backend(arch, threads, scene.solver.precision, compile_cache=compile_cache)
+    if not backend.on_cpu:
+        return backend
+    threads = threads or useful_threads(estimate_particles(scene), backend.threads)
+    return replace(backend, threads=threads, optimisation=cheapest(scene, expected_steps(), threads))
+
+
+def suits_batch(particles: int, backend: Backend) -> bool:
+    """Return whether many runs of so many particles are faster in one batch than one by one."""
+    return backend.on_cpu or particles < FEW_ON_GPU
+
+
+def build_run(
+    scene: Scene, backend: Backend, particles: list[BodyParticles] | None = None, *, force: bool = False
+) -> Run:
+    """Put a scene on the device of a started backend, alone.
+
+    Args:
+        particles: one entry per body, in place of the scene's own sampling.
+        force: take time.step as it is, above the stable step too.
+
+    Raises:
+        InputError: a particle is not in the domain, or the backend cannot compute the scene.
+    """
+    require_contact_possible(scene, backend)
+    particles = particles or sample_bodies(scene)
+    return Run(Batch(CompiledKind.of(scene, particles).padded(), backend), 0, scene, particles, force=force)

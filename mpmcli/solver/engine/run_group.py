@@ -81,12 +81,12 @@ class RunGroup:
         self.first = slot * batch.kind.particles[g]
         self.row = slot * batch.kind.bodies[g]
         self.floor: np.ndarray | None = None
-        self._counts, self._column = batch.counts[slot], batch.layout.count.particles[g]
+        self._state, self._number = batch.state(slot), g
 
     @property
     def active(self) -> int:
         """Particles that take part, which come first."""
-        return int(self._counts[self._column])
+        return self._state.particles[self._number]
 
     def read(self) -> dict[str, np.ndarray]:
         """Return x, v, C, deformation, internal, (n, k), id and body, (n), in the solver's order."""
@@ -140,14 +140,13 @@ def groups_of(batch: Batch, slot: int, scene: Scene, particles: Sequence[BodyPar
     """Put the particles of a run, one entry per source, on the device; return its groups, one for each law."""
     first_ids = np.concatenate([[0], np.cumsum([len(b.position) for b in particles])])
     lost, groups, layers = batch.device.particles.lost, [], Layers.of(scene)
-    counts, count_of = batch.counts[slot], batch.layout.count
+    state = batch.state(slot)
     for g, shared in enumerate(batch.kind.members):
         bodies = members_of(scene, shared.name)
         own = [particles[i] for i in bodies]
         law = type(shared)([scene.sources[i].material for i in bodies], scene.dimension)
         group = RunGroup(batch, g, slot, law, bodies, table_of(law, own), sum(len(b.position) for b in own))
-        counts[count_of.particles[g]] = sum(len(b.position) for b in own if not b.waits)
-        counts[count_of.capacity[g]] = group.count
+        state.particles[g], state.capacity[g] = sum(len(b.position) for b in own if not b.waits), group.count
         group.floor = floor_of(scene, law, bodies)
         surfaces = [
             rest_surface(scene.sources[i], particles[i], scene.domain.spacing if layers.has_own(i) else None)

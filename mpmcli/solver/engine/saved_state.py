@@ -9,10 +9,7 @@ import numpy as np
 
 from mpmcli.errors import InputError
 from mpmcli.quick_taichi import ti
-from mpmcli.solver.drive.forces import ExternalForces
 from mpmcli.solver.engine.batch import Batch
-from mpmcli.solver.engine.run_numbers import Row
-from mpmcli.solver.engine.step_control import StepControl
 
 # Bytes of a number on the device.
 SIZES = {ti.f32: 4, ti.f64: 8, ti.i32: 4}
@@ -58,49 +55,6 @@ class ArraysOnDevice(Mapping[str, np.ndarray]):
         return len(self._fields) + len(self._others)
 
 
-class Progress:
-    """What changes in a run beside its particles.
-
-    Attributes:
-        time: s, in double precision; step_count: steps taken; last_step: size of the last one, s, 0 before the first.
-        speed: bound on the speed of every particle, m/s; courant: cells that the fastest one moved in the last step.
-        drift: cells that a particle may have moved since particles were sorted; infinite before the first sort.
-        first_stable_step: s, at the start of the run.
-        owed: time by which velocities lag behind the middle of the last step, s, after a step that fell steeply.
-        unrelaxed: s since volumes were last relaxed, in unrelaxed_steps steps.
-        step_control, external_forces: what is known of the bounds on the next step.
-    """
-
-    NUMBERS = (
-        *("time", "step_count", "last_step", "speed", "courant", "drift", "first_stable_step"),
-        *("owed", "unrelaxed", "unrelaxed_steps"),
-    )
-
-    def __init__(self, step_control: StepControl, external_forces: ExternalForces) -> None:
-        self.step_control = step_control
-        self.external_forces = external_forces
-        self.begin()
-
-    def begin(self) -> None:
-        """Begin a run with the particles that are on the device."""
-        self.time = 0.0
-        self.step_count = 0
-        self.last_step = 0.0
-        self.speed = self.step_control.speed
-        self.courant = 0.0
-        self.drift = math.inf
-        self.first_stable_step = 0.0
-        self.owed = 0.0
-        self.unrelaxed = 0.0
-        self.unrelaxed_steps = 0
-        self.step_control.begin()
-
-    @property
-    def velocity_time(self) -> float:
-        """Time to which velocities have advanced, s: the middle of the last step, less what is owed."""
-        return self.time - 0.5 * self.last_step - self.owed
-
-
 def shape_of(field: ti.Field) -> tuple[int, ...]:
     """Return the shape of a field as a numpy array."""
     if isinstance(field, ti.lang.matrix.MatrixField):
@@ -110,8 +64,6 @@ def shape_of(field: ti.Field) -> tuple[int, ...]:
 
 # The tiles of a sparse grid that have numbers; of the table of a sort what concerns these.
 BLOCKS, START = "grid.blocks", "{}.block_start"
-# Columns that the scene sets, and that one which goes on for longer sets otherwise: a collider may become faster.
-OF_SCENE = ("end", "until", "collider"), ("frames", "sheets")
 
 
 def read_batch(batch: Batch) -> ArraysOnDevice:
@@ -135,25 +87,14 @@ def write_batch(batch: Batch, arrays: Mapping[str, np.ndarray]) -> None:
         field.from_numpy(arrays[name])
     if batch.device.grid.sparse:
         _write_blocks(batch, arrays)
-    for row, name, layout, kept in (
-        (batch.numbers[0], "numbers", batch.layout.real, OF_SCENE[0]),
-        (batch.counts[0], "counts", batch.layout.count, OF_SCENE[1]),
-    ):
-        columns = np.hstack([getattr(layout, column) for column in kept]).astype(int)
-        own = row[columns].copy()
+    for name, (row,) in (("numbers", batch.numbers), ("counts", batch.counts)):
+        # A run that goes on for longer has an end and a bound by colliders of its own.
+        columns = batch.layout.of_scene(name)
+        own = row[columns]
         row[:] = arrays[name]
         row[columns] = own
     if batch.backend.on_cpu:
         batch.cpu.share_work(batch.counts)
-
-
-def aim_on(row: Row) -> None:
-    """Let a run that has reached its last frame go on to the next one, as the kernel does after every other frame."""
-    frames = row.count("frames")
-    if row.count("arrived") == 1 and row.count("frame") < frames:
-        row.set_counts(frame=row.count("frame") + 1, limit=0, arrived=0)
-        row.set(smallest=math.inf, largest=0.0, largest_courant=0.0)
-    row.set(target=row.number("end") * row.count("frame") / frames)
 
 
 def _fields(batch: Batch) -> dict[str, ti.Field]:

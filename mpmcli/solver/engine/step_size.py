@@ -1,32 +1,45 @@
-"""What is computed of a run as a whole: its next step, and what follows from the last one (docs/theory.md, 6).
+"""The time step of a run (docs/theory.md, 6).
 
-Kernels call these functions, and the host where a device has no double precision.
+`StepSize` chooses the next step, and counts what follows from the last one: kernels call it with the `RunState` of a
+run; so does the host, where a device has no double precision. `StepControl` measures the state of the particles where
+it is due, and the bounds that follow (6.7).
 """
 
-from collections.abc import Sequence
+import math
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict
 
 from taichi.lang.impl import inside_kernel
 
+from mpmcli.boundaries.doubles import as_double
+from mpmcli.materials.law import StateBound
 from mpmcli.quick_taichi import ti
-from mpmcli.solver.drive.forces import DriveValues
-from mpmcli.solver.engine.run_numbers import ATTEND, BEYOND, COLLAPSED, LIMITS, LOST, Layout
+from mpmcli.scene import Scene
+from mpmcli.solver.drive.forces import DriveValues, HostValues
+from mpmcli.solver.engine.device import Device
+from mpmcli.solver.engine.run_state import ATTEND, BEYOND, COLLAPSED, LIMITS, LOST, Layout, RunState
+from mpmcli.solver.particles.state_bounds import StateBounds
 from mpmcli.solver.transfer.kept_motion import kept_share
+from mpmcli.solver.transfer.particle_update import SMALLEST_J
+from mpmcli.solver.transfer.redistribution import farthest_shift
 from mpmcli.solver.transfer.splines import TransferScheme
-from mpmcli.stability.limits import COURANT, DEFORMATION
-from mpmcli.stability.transfer_factors import INTERVAL
+from mpmcli.stability.limits import DEFORMATION, Limit, crossing_step, deformation_limit, mode_limit, speed_limit
+from mpmcli.stability.transfer_factors import INTERVAL, step_inertia
 
 COLLIDER, DEFORMING, FORCE, FORCED, MAXIMUM, CROSSING = (
     LIMITS.index(name) for name in ("collider", "deformation", "force", "forced", "maximum", "speed")
 )
-
-
-@ti.pyfunc
-def as_double(number: ti.template()):
-    """Return a number in double precision: a literal in a kernel has that of particles."""
-    if ti.static(inside_kernel()):
-        return ti.cast(number, ti.f64)
-    else:
-        return float(number)
+# A bound falls at once, and rises only to the smallest of the last HOLD to 2 HOLD steps, and only where that is RISE
+# times what it was: a step that follows the oscillation of a particle, always smaller in the same phase of it, drives
+# that oscillation. Lone particles of the neo-Hookean law let go at strains of 5 to 40 % gained up to 27 times their
+# energy in 10,000 steps where the bound rose by a thousandth per step, and up to 4 times here.
+HOLD, RISE = 128, 1.05
+# Ratio of the stable step to the first one at which a run stops: steps that small do not recover.
+COLLAPSE = 1e-4
+# Share of a step by which the time left to a target may exceed a whole number of steps.
+SLACK = 1e-6
+INFINITE = math.inf
 
 
 @ti.pyfunc
@@ -38,9 +51,19 @@ def as_real(number: ti.template()):
         return number
 
 
+@ti.pyfunc
+def nearer(value: ti.f64, limit: int, bound: ti.f64, code: int):
+    """Return the smaller one of a bound on the step and another one, and its code."""
+    nearest, of_nearest = value, limit
+    if bound < value or (bound == value and limit > code):
+        nearest = bound
+        of_nearest = code
+    return nearest, of_nearest
+
+
 @ti.data_oriented
 class StepSize:
-    """The steps of the runs of a batch, w being the number of a run; numbers and counts as of `run_numbers`."""
+    """The steps of the runs of a batch."""
 
     def __init__(
         self,
@@ -54,223 +77,382 @@ class StepSize:
     ) -> None:
         """Prepare; `drifts`: whether particles move on the grid; shift: cells by which some steps shift them."""
         self.drifts, self.shift = drifts, shift
-        self.real, self.count = layout.real, layout.count
         self.values = values
         self.groups, self.bodies, self.scheme = tuple(groups), layout.bodies, scheme
 
-    @ti.pyfunc
-    def begin(self, w: int, numbers: ti.template(), counts: ti.template()):
-        """Choose the next step.
+    @classmethod
+    def of(cls, device: Device, layout: Layout, values: DriveValues | HostValues) -> "StepSize":
+        """Return that of the runs of a batch, with what depends on time in `values`."""
+        drifts = device.particles.has_contact or not all(group.total for group in device.groups)
+        shift = farthest_shift(device.grid.fine)
+        return cls(layout, device.groups, values, device.grid.scheme, drifts=drifts, shift=shift)
 
-        Returns the step and the kick, s, float64, and the step is 0 where it collapsed or the host must fill time
-        tables; the number of such steps to the target; the code of the bound that sets the step; the bound by
-        deformation, s; and the stable step, s.
+    @ti.pyfunc
+    def begin(self, run: ti.template()):
+        """Choose the next step, and return whether it can be taken.
+
+        It cannot where it has collapsed, or where the host must fill time tables.
         """
-        largest, limit, deformation = self.stable_step(w, numbers, counts)
-        left = numbers[w, self.real.target] - numbers[w, self.real.time]
-        splits = ti.max(ti.ceil(left / largest - numbers[w, self.real.slack]), 1.0)
-        dt = left / splits
-        given = numbers[w, self.real.given]
-        if given > 0:
-            splits = as_double(1.0)
-            dt = given
-        due_kick = numbers[w, self.real.owed] + 0.5 * (numbers[w, self.real.last_step] + dt)
-        kick = ti.min(due_kick, dt / numbers[w, self.real.safety])
-        since = self.velocity_time(w, numbers)
+        value, limit = self.stable_step(run)
+        run.step_limit = limit
+        run.stable = ti.min(value, run.end)
+        left = run.target - run.time
+        steps = ti.max(ti.ceil(left / value - as_double(SLACK)), 1.0)
+        dt = left / steps
+        if run.given > 0:
+            steps = as_double(1.0)
+            dt = run.given
+        run.dt = dt
+        run.steps_to_target = steps
+        due = run.kick_carry + 0.5 * (run.last_step + dt)
+        kick = ti.min(due, dt / run.safety)
+        run.kick = kick
+        since = run.velocity_time
         # First: as long as the tables hold another time, the step means nothing.
         ends = since + kick
         if ti.static(len(self.values.motions) > 0):
-            ends = ti.max(ends, numbers[w, self.real.time] + dt)
-        if ends > numbers[w, self.real.horizon]:
-            counts[w, self.count.status] = BEYOND
-            dt = 0.0 * dt
-        elif largest < numbers[w, self.real.collapse] and given == 0:
-            counts[w, self.count.status] = COLLAPSED
-            dt = 0.0 * dt
+            ends = ti.max(ends, run.time + dt)
+        possible = True
+        if ends > run.horizon:
+            run.status = BEYOND
+            possible = False
+        elif value < as_double(COLLAPSE) * run.first_stable_step and run.given == 0:
+            run.status = COLLAPSED
+            possible = False
         else:
-            numbers[w, self.real.owed] = due_kick - kick
-            self.values.set_means(w, since, since + kick)
-            if ti.static(self.scheme.keeps_before):
-                self.keep(w, dt, numbers)
-        return dt, kick, splits, limit, deformation, ti.min(largest, numbers[w, self.real.end])
+            run.kick_carry = due - kick
+            self.values.set_means(run.w, since, since + kick)
+            if ti.static(self.scheme.keeps_flip_velocity):
+                self.keep(run)
+            self.relax(run)
+        return possible
 
     @ti.pyfunc
-    def keep(self, w: int, dt: ti.f64, numbers: ti.template()):
-        """Find the share of its motion that each body keeps in a step."""
-        for g, group in ti.static(enumerate(self.groups)):
-            slowest = numbers[w, self.real.infinity]
-            if numbers[w, self.real.rate[g]] > 0:
-                slowest = DEFORMATION / numbers[w, self.real.rate[g]]
-            for i in range(self.bodies[g]):
-                bound = ti.min(numbers[w, self.real.own[g] + i], slowest)
-                group.kept[w * self.bodies[g] + i] = as_real(kept_share(dt / bound, self.scheme.damped))
-
-    @ti.pyfunc
-    def velocity_time(self, w: int, numbers: ti.template()):
-        """Return the time to which velocities have advanced, s, float64, as `Progress.velocity_time`."""
-        return numbers[w, self.real.time] - 0.5 * numbers[w, self.real.last_step] - numbers[w, self.real.owed]
-
-    @ti.pyfunc
-    def end(
-        self,
-        w: int,
-        dt: ti.f64,
-        splits: ti.f64,
-        limit: int,
-        deformation: ti.f64,
-        speed: ti.f64,
-        numbers: ti.template(),
-        counts: ti.template(),
-    ):
-        """Count a step with this largest speed of a node, m/s, -1 where a particle was lost. Its rates are stored."""
-        numbers[w, self.real.time] = numbers[w, self.real.time] + dt
-        if splits == 1:
-            numbers[w, self.real.time] = numbers[w, self.real.target]
-        numbers[w, self.real.last_step] = dt
-        counts[w, self.count.steps] += 1
-        counts[w, self.count.budget] -= 1
-        if speed >= 0:
-            courant = dt * speed / numbers[w, self.real.spacing]
-            # What waits for an emitter counts from the start.
-            numbers[w, self.real.speed] = ti.max(speed, numbers[w, self.real.slowest])
-            numbers[w, self.real.courant] = courant
-            if ti.static(self.drifts):
-                numbers[w, self.real.drift] = numbers[w, self.real.drift] + courant
-            self.hold(w, ti.min(numbers[w, self.real.stiffness], deformation), numbers)
-            due = self.control(w, dt, numbers, counts)
-            self.book(w, dt, courant, limit, numbers, counts)
-            if splits == 1:
-                counts[w, self.count.arrived] = 1
-            if due or (splits == 1 and counts[w, self.count.records] == 0):
-                counts[w, self.count.status] = ATTEND
+    def relax(self, run: ti.template()):
+        """Count a step, and set the time over which it relaxes volumes."""
+        run.drift = run.drift + self.shift_ahead(run)
+        run.relaxed = as_double(0.0)
+        run.unrelaxed = run.unrelaxed + run.dt
+        if run.unrelaxed_steps + 1 < INTERVAL:
+            run.unrelaxed_steps += 1
         else:
-            counts[w, self.count.status] = LOST
+            run.relaxed = run.unrelaxed
+            run.unrelaxed_steps = 0
+            run.unrelaxed = as_double(0.0)
 
     @ti.pyfunc
-    def stable_step(self, w: int, numbers: ti.template(), counts: ti.template()):
-        """Return the step, s, and the code of its bound, and the bound by deformation, s."""
-        value = numbers[w, self.real.stiffness]
-        limit = counts[w, self.count.stiffness_limit]
-        sharpest = numbers[w, self.real.rate[0]]
-        for g in ti.static(range(1, len(self.groups))):
-            sharpest = ti.max(sharpest, numbers[w, self.real.rate[g]])
-        deformation = numbers[w, self.real.infinity]
-        if sharpest > 0:
-            deformation = DEFORMATION / sharpest
-        if deformation < value or (deformation == value and limit > DEFORMING):
-            value = deformation
-            limit = DEFORMING
-        value = ti.min(value, numbers[w, self.real.held])
-        speed = ti.max(numbers[w, self.real.speed], numbers[w, self.real.wall_speed])
-        pull = numbers[w, self.real.pull]
-        if ti.static(self.values.gravity_varies):
-            # The next kick ends in the middle of a step that is no longer than the other bounds allow.
-            ahead = ti.min(numbers[w, self.real.safety] * value, numbers[w, self.real.end])
-            pull += self.values.largest_gravity(w, self.velocity_time(w, numbers), numbers[w, self.real.time] + ahead)
-        h = numbers[w, self.real.spacing]
-        crossing = numbers[w, self.real.infinity]
-        if speed != 0 or pull != 0:
-            crossing = 2 * COURANT * h / (speed + ti.sqrt(speed * speed + 4 * pull * COURANT * h))
-        if crossing < value or (crossing == value and limit > CROSSING):
-            value = crossing
-            limit = CROSSING
-        force = numbers[w, self.real.force]
-        if force < value or (force == value and limit > FORCE):
-            value = force
-            limit = FORCE
-        collider = numbers[w, self.real.collider]
-        if collider < value or (collider == value and limit > COLLIDER):
-            value = collider
-            limit = COLLIDER
-        value = numbers[w, self.real.safety] * value
-        maximum = numbers[w, self.real.maximum]
-        if maximum < value:
-            value = maximum
-            limit = MAXIMUM
-        elif counts[w, self.count.forced] == 1:
-            value = maximum
-            limit = FORCED
-        return value, limit, deformation
-
-    @ti.pyfunc
-    def aim(self, w: int, numbers: ti.template(), counts: ti.template()):
-        """Go on to the next frame after one that was recorded."""
-        index = as_double(counts[w, self.count.frame])
-        numbers[w, self.real.target] = numbers[w, self.real.end] * index / as_double(counts[w, self.count.frames])
-        numbers[w, self.real.smallest] = numbers[w, self.real.infinity]
-        numbers[w, self.real.largest] = as_double(0.0)
-        numbers[w, self.real.largest_courant] = as_double(0.0)
-        counts[w, self.count.limit] = 0
-        counts[w, self.count.arrived] = 0
-
-    @ti.pyfunc
-    def shift_ahead(self, w: int, counts: ti.template()):
+    def shift_ahead(self, run: ti.template()):
         """Return the cells by which the next step may shift particles before it scatters them."""
         cells = as_double(0.0)
-        if counts[w, self.count.unrelaxed_steps] + 1 >= INTERVAL:
+        if run.unrelaxed_steps + 1 >= INTERVAL:
             cells = as_double(self.shift)
         return cells
 
     @ti.pyfunc
-    def relaxed_in(self, w: int, dt: ti.f64, numbers: ti.template(), counts: ti.template()):
-        """Count a step and return the time over which it relaxes volumes, s."""
-        relaxed = numbers[w, self.real.unrelaxed] + dt
-        numbers[w, self.real.drift] = numbers[w, self.real.drift] + self.shift_ahead(w, counts)
-        if counts[w, self.count.unrelaxed_steps] + 1 < INTERVAL:
-            counts[w, self.count.unrelaxed_steps] += 1
-            numbers[w, self.real.unrelaxed] = relaxed
-            relaxed = as_double(0.0)
+    def keep(self, run: ti.template()):
+        """Find the share of its motion that each body keeps in a step."""
+        for g, group in ti.static(enumerate(self.groups)):
+            slowest = as_double(INFINITE)
+            if run.rate[g] > 0:
+                slowest = DEFORMATION / run.rate[g]
+            for i in range(self.bodies[g]):
+                bound = ti.min(run.own[g][i], slowest)
+                group.kept[run.w * self.bodies[g] + i] = as_real(kept_share(run.dt / bound, self.scheme.damped))
+
+    @ti.pyfunc
+    def end(self, run: ti.template(), speed: ti.f64):
+        """Count a step with this largest speed of a node, m/s, -1 where a particle was lost. Its rates are stored."""
+        dt = run.dt
+        run.time = run.time + dt
+        if run.steps_to_target == 1:
+            run.time = run.target
+        run.last_step = dt
+        run.step_count = run.step_count + 1
+        run.budget -= 1
+        if speed >= 0:
+            courant = dt * speed / run.spacing
+            # What waits for an emitter counts from the start.
+            run.speed = ti.max(speed, run.slowest)
+            run.courant = courant
+            if ti.static(self.drifts):
+                run.drift = run.drift + courant
+            self.limit_rise(run, ti.min(run.stiffness, run.deformation))
+            due = self.watch(run)
+            self.record_step(run)
+            if run.steps_to_target == 1:
+                run.arrived = 1
+            if due or (run.steps_to_target == 1 and run.records == 0):
+                run.status = ATTEND
         else:
-            counts[w, self.count.unrelaxed_steps] = 0
-            numbers[w, self.real.unrelaxed] = as_double(0.0)
-        return relaxed
+            run.status = LOST
 
     @ti.pyfunc
-    def hold(self, w: int, bound: ti.f64, numbers: ti.template()):
-        """Keep the smallest bound of the last steps, see `HeldBound`."""
-        low = ti.min(numbers[w, self.real.low], bound)
-        held = ti.min(numbers[w, self.real.held], bound)
-        steps = numbers[w, self.real.held_steps] + 1
-        if steps >= numbers[w, self.real.hold]:
-            lowest = ti.min(numbers[w, self.real.low_before], low)
-            if lowest > numbers[w, self.real.rise] * held:
+    def stable_step(self, run: ti.template()):
+        """Return the step to take, s, safety included, and the code of the bound that sets it."""
+        value, limit = self.nearest(run)
+        value = run.safety * value
+        if run.maximum < value:
+            value = run.maximum
+            limit = MAXIMUM
+        elif run.forced == 1:
+            value = run.maximum
+            limit = FORCED
+        return value, limit
+
+    @ti.pyfunc
+    def nearest(self, run: ti.template()):
+        """Return the smallest bound on the next step, s, and its code; store the bound by deformation."""
+        run.deformation = self.deformation_limit(run)
+        value, limit = nearer(run.stiffness, run.stiffness_limit, run.deformation, DEFORMING)
+        value = ti.min(value, run.held)
+        value, limit = nearer(value, limit, self.speed_limit(run, value), CROSSING)
+        value, limit = nearer(value, limit, run.force, FORCE)
+        value, limit = nearer(value, limit, run.collider, COLLIDER)
+        return value, limit
+
+    @ti.pyfunc
+    def deformation_limit(self, run: ti.template()):
+        """Return the bound by the largest rate of deformation, s."""
+        max_rate = run.rate[0]
+        for g in ti.static(range(1, len(self.groups))):
+            max_rate = ti.max(max_rate, run.rate[g])
+        bound = as_double(INFINITE)
+        if max_rate > 0:
+            bound = DEFORMATION / max_rate
+        return bound
+
+    @ti.pyfunc
+    def speed_limit(self, run: ti.template(), value: ti.f64):
+        """Return the bound by the fastest particle, s, where the others allow a step `value`."""
+        speed, pull = ti.max(run.speed, run.wall_speed), run.pull
+        if ti.static(self.values.gravity_varies):
+            # The next kick ends in the middle of a step that is no longer than the other bounds allow.
+            ahead = ti.min(run.safety * value, run.end)
+            pull += self.values.largest_gravity(run.w, run.velocity_time, run.time + ahead)
+        bound = as_double(INFINITE)
+        if speed != 0 or pull != 0:
+            (step,) = ti.static((crossing_step(run.spacing, speed, pull, ti.sqrt),))
+            bound = step
+        return bound
+
+    @ti.pyfunc
+    def next_frame(self, run: ti.template()):
+        """Go on to the output time of the frame `run.frame`, and begin to record steps for it."""
+        run.target = run.end * as_double(run.frame) / as_double(run.frames)
+        self.forget_steps(run)
+
+    @ti.pyfunc
+    def forget_steps(self, run: ti.template()):
+        """Begin to record steps for the ledger."""
+        run.smallest = as_double(INFINITE)
+        run.largest = as_double(0.0)
+        run.largest_courant = as_double(0.0)
+        run.limit = 0
+        run.arrived = 0
+
+    @ti.pyfunc
+    def limit_rise(self, run: ti.template(), bound: ti.f64):
+        """Let the bound that is held fall at once to a bound, and rise late, see HOLD."""
+        low, held = ti.min(run.low, bound), ti.min(run.held, bound)
+        steps = run.held_steps + 1
+        if steps >= HOLD:
+            lowest = ti.min(run.low_before, low)
+            if lowest > as_double(RISE) * held:
                 held = lowest
-            numbers[w, self.real.low_before] = low
-            low = numbers[w, self.real.infinity]
+            run.low_before = low
+            low = as_double(INFINITE)
             steps -= steps
-        numbers[w, self.real.held] = held
-        numbers[w, self.real.low] = low
-        numbers[w, self.real.held_steps] = steps
+        run.held, run.low, run.held_steps = held, low, steps
 
     @ti.pyfunc
-    def control(self, w: int, dt: ti.f64, numbers: ti.template(), counts: ti.template()):
+    def watch(self, run: ti.template()):
         """Count a step; return whether the host must measure."""
         due = False
         for g in ti.static(range(len(self.groups))):
-            counts[w, self.count.unwatched[g]] += 1
-            strain = dt * numbers[w, self.real.rate[g]]
-            numbers[w, self.real.change[g]] = (
-                numbers[w, self.real.change[g]] + strain * numbers[w, self.real.sensitivity[g]]
-            )
-            numbers[w, self.real.hardened[g]] = (
-                numbers[w, self.real.hardened[g]] + strain * numbers[w, self.real.hardening[g]]
-            )
-            allowed = numbers[w, self.real.growth_allowed]
-            if counts[w, self.count.unwatched[g]] >= counts[w, self.count.longest]:
+            run.unwatched[g] += 1
+            strain = run.dt * run.rate[g]
+            run.change[g] = run.change[g] + strain * run.sensitivity[g]
+            run.hardened[g] = run.hardened[g] + strain * run.hardening[g]
+            if run.unwatched[g] >= run.longest:
                 due = True
-            if numbers[w, self.real.change[g]] >= allowed or numbers[w, self.real.hardened[g]] >= allowed:
+            if run.change[g] >= run.growth_allowed or run.hardened[g] >= run.growth_allowed:
                 due = True
         return due
 
     @ti.pyfunc
-    def book(self, w: int, dt: ti.f64, courant: ti.f64, limit: int, numbers: ti.template(), counts: ti.template()):
+    def record_step(self, run: ti.template()):
         """Keep the smallest step with its bound, the largest one, and the largest Courant number, for the ledger."""
-        smallest = numbers[w, self.real.smallest]
-        between = numbers[w, self.real.smallest_courant]
-        same = dt == smallest and (courant < between or (courant == between and limit < counts[w, self.count.limit]))
-        if dt < smallest or same:
-            numbers[w, self.real.smallest] = dt
-            numbers[w, self.real.smallest_courant] = courant
-            counts[w, self.count.limit] = limit
-        numbers[w, self.real.largest] = ti.max(numbers[w, self.real.largest], dt)
-        numbers[w, self.real.largest_courant] = ti.max(numbers[w, self.real.largest_courant], courant)
+        dt, courant, limit = run.dt, run.courant, run.step_limit
+        before = run.smallest_courant
+        same = dt == run.smallest and (courant < before or (courant == before and limit < run.limit))
+        if dt < run.smallest or same:
+            run.smallest = dt
+            run.smallest_courant = courant
+            run.limit = limit
+        run.largest = ti.max(run.largest, dt)
+        run.largest_courant = ti.max(run.largest_courant, courant)
+
+
+# Most steps between two measurements of the state, and with it of forces. A measurement is due earlier where a
+# stiffness may have grown since by more than this share of the margin that time.safety leaves; one that has fallen is
+# noticed late. The share is near 1 as every step reads the rate of deformation back.
+MOST_UNWATCHED_STEPS, MOST_PUSHED_STEPS, UNWATCHED_SHARE = 256, 64, 0.95
+
+
+class StepControl:
+    """The last measurement of each group of particles, and the bounds on the step that follow from it.
+
+    Attributes:
+        seconds: wall time spent so far on measuring.
+    """
+
+    def __init__(
+        self, scene: Scene, groups: Sequence, state: RunState, measurements: Sequence[Callable[[], StateBounds]]
+    ) -> None:
+        """Take the first measurement of each group, see `RunGroup`; `measurements` return the last one."""
+        self._groups, self._state = groups, state
+        self._names = tuple(body.name for body in scene.sources)
+        self._spacing = scene.domain.spacing
+        self._inertia = step_inertia(scene.solver)
+        self._measure = measurements
+        state.longest = MOST_PUSHED_STEPS if scene.pushes else MOST_UNWATCHED_STEPS
+        # A step of safety times the limit is stable until the stiffness has grown to safety^-2 of what it was.
+        state.growth_allowed = -2 * UNWATCHED_SHARE * math.log(scene.time.safety)
+        self.seconds = 0.0
+        self._bounds = [measure() for measure in measurements]
+        # Per group, whether it has not been measured since the start.
+        self._at_start = [True] * len(groups)
+        self._limits = [self._limits_of(g, bounds) for g, bounds in enumerate(self._bounds)]
+
+    def begin(self) -> None:
+        """Write the bounds of time 0."""
+        self._state.rate = [bounds.deformation_rate for bounds in self._bounds]
+        self._write_limits()
+
+    def save(self) -> dict[str, object]:
+        """Return what was measured of each group, as plain numbers, lists and dictionaries."""
+        return {"bounds": [asdict(bounds) for bounds in self._bounds], "at_start": list(self._at_start)}
+
+    def load(self, saved: dict) -> None:
+        """Take what `save` returned; the numbers of the run are loaded on their own."""
+        self._at_start = list(saved["at_start"])
+        for g, bounds in enumerate(saved["bounds"]):
+            internal = {name: tuple(pair) for name, pair in bounds["bound"]["internal"].items()}
+            bound = StateBound(**bounds["bound"] | {"internal": internal})
+            self._bounds[g] = StateBounds(**bounds | {"bound": bound})
+            self._limits[g] = self._limits_of(g, self._bounds[g])
+
+    @property
+    def speed(self) -> float:
+        """Largest speed as last measured, m/s."""
+        return max(bounds.speed for bounds in self._bounds)
+
+    @property
+    def fresh(self) -> bool:
+        """Whether every group was measured after the last step."""
+        return max(self._state.unwatched) == 0
+
+    def limits(self) -> list[Limit]:
+        """Return every bound as last measured, and that of the rates of deformation in the last step."""
+        return [limit for limits in self._limits for limit in limits] + [_deformation_limit(self._state.rate)]
+
+    def _own_limits(self) -> list[list[float]]:
+        """Return the step that each body of each group allows by its stiffness, and by the speed of its group, s."""
+        return [
+            [
+                min(
+                    speed_limit(self._spacing, bounds.speed, 0.0),
+                    *(limit.value for limit in limits if limit.body == self._names[place]),
+                )
+                for place in group.bodies
+            ]
+            for group, bounds, limits in zip(self._groups, self._bounds, self._limits, strict=True)
+        ]
+
+    def limits_now(self) -> list[Limit]:
+        """Return every bound by the state as it is, without storing it."""
+        states = [measure() for measure in self._measure]
+        limits = [limit for g, bounds in enumerate(states) for limit in self._limits_of(g, bounds)]
+        return [*limits, _deformation_limit(bounds.deformation_rate for bounds in states)]
+
+    @property
+    def stiffest(self) -> Limit:
+        """The smallest bound by stiffness."""
+        return min(limit for limits in self._limits for limit in limits)
+
+    def due(self) -> list[int]:
+        """Return the groups to measure now, after steps that a kernel has taken.
+
+        Groups that harden are measured after every such series: their bounds count as read back.
+        """
+        began = time.perf_counter()
+        state, due = self._state, []
+        for g, group in enumerate(self._groups):
+            if state.unwatched[g] >= state.longest:
+                due.append(g)
+            elif max(state.change[g], state.hardened[g]) >= state.growth_allowed:
+                known = self._measure[g]() if group.law.hardening > 0 else None
+                if known is not None and _sound(known):
+                    self._take(g, known)
+                else:
+                    due.append(g)
+        self.seconds += time.perf_counter() - began
+        return due
+
+    def sound(self) -> bool:
+        """Return whether no particle is crushed, inverted or NaN, by a measurement that is not stored."""
+        return all(_sound(measure()) for measure in self._measure)
+
+    def measure(self, due: Iterable[int]) -> bool:
+        """Measure some groups, and return whether they are sound: none crushed, inverted or NaN."""
+        began = time.perf_counter()
+        sound = True
+        for g in due:
+            bounds = self._measure[g]()
+            sound = sound and _sound(bounds)
+            if sound:
+                self._take(g, bounds)
+                self._state.unwatched[g] = 0
+        self.seconds += time.perf_counter() - began
+        return sound
+
+    def _take(self, g: int, bounds: StateBounds) -> None:
+        """Store the bounds of a group's state, and the limits that follow from them."""
+        self._bounds[g] = bounds
+        self._at_start[g] = False
+        self._state.rate[g] = bounds.deformation_rate
+        self._state.change[g] = self._state.hardened[g] = 0.0
+        self._limits[g] = self._limits_of(g, bounds)
+        self._write_limits()
+
+    def _limits_of(self, g: int, bounds: StateBounds) -> list[Limit]:
+        """Return the limits that the stiffness of the g-th group sets within these bounds of its state."""
+        group, bound = self._groups[g], bounds.bound
+        if self._at_start[g]:
+            # What starts deformed springs back; later the bound is held through all phases of an oscillation.
+            bound = group.law.rebound_bound(bound)
+        limits = []
+        for place, parameters in zip(group.bodies, group.law.members, strict=True):
+            modes = group.law.reference_modes if group.total else group.law.modes
+            for mode in modes(parameters, bound):
+                value, cause = mode_limit(
+                    self._spacing, parameters.density, mode.stiffness, mode.viscosity, self._inertia
+                )
+                limits.append(Limit(value, cause, self._names[place]))
+        return limits
+
+    def _write_limits(self) -> None:
+        """Write the bounds that follow from the measurements."""
+        self._state.stiffness, self._state.stiffness_limit = self.stiffest.value, LIMITS.index(self.stiffest.name)
+        for g, own in enumerate(self._own_limits()):
+            for i, bound in enumerate(own):
+                self._state.own[g][i] = bound
+
+
+def _sound(bounds: StateBounds) -> bool:
+    """Return whether no particle is crushed, inverted or NaN."""
+    return bounds.bound.volume_ratio_min > SMALLEST_J
+
+
+def _deformation_limit(rates: Iterable[float]) -> Limit:
+    return Limit(deformation_limit(max(rates)), "deformation", "")

@@ -3,8 +3,8 @@
 import numpy as np
 
 from mpmcli.quick_taichi import ti
+from mpmcli.solver.frames.builder import Sums, axis_pairs
 from mpmcli.solver.frames.columns import FrameColumns, stress_entries
-from mpmcli.solver.frames.ledger_sums import Sums, axis_pairs
 from mpmcli.solver.particles.arrays import MASS, VOLUME
 from mpmcli.solver.particles.sort import stay_rolled
 from mpmcli.solver.particles.state_bounds import volume_ratio
@@ -21,7 +21,7 @@ from mpmcli.solver.transfer.lanes import (
     zero_lanes,
 )
 from mpmcli.solver.transfer.particle_update import SMALLEST_J
-from mpmcli.solver.transfer.volume_average import stretch_to
+from mpmcli.solver.transfer.volume import stretch_to
 
 # Entry of the sums that is 0 where a particle is crushed, inverted or not finite, else 1.
 SOUND = 5
@@ -55,7 +55,7 @@ def show_range(
     gradient_at: int,
     tau_at: int,
     activity_at: int,
-    shown: ti.template(),
+    frame_buffer: ti.template(),
     energies: ti.template(),
     offset: int,
 ):
@@ -85,7 +85,7 @@ def show_range(
         own = ti.min(LANES, first + count - begin)
         load_lanes(group, begin, own, affine, deformation, internal)
         load_rows(group, begin, own, rows)
-        if ti.static(group.averaged):
+        if ti.static(group.uses_f_bar):
             for lane in range(own):
                 missing[lane] = group.to_mean[begin + lane]
         # Half a step back, where the velocities are, and now: a loop, so that the law is compiled once.
@@ -93,7 +93,7 @@ def show_range(
             for lane in range(LANES):
                 C, inner = matrix_of(affine, 0, d, lane), vector_of(internal, 0, inners, lane)
                 stored, constants = stored_of(group, deformation, lane), constants_of(rows, lane)
-                if ti.static(group.averaged):
+                if ti.static(group.uses_f_bar):
                     stored *= stretch_to(missing[lane], d)
                 state = deformed_on(group.law, stored, C, 0.5 * (k - 1) * dt)
                 tau, tau_zz, after, inner_after = group.law.respond(state, inner, C, dt, constants)
@@ -123,27 +123,27 @@ def show_range(
             velocity, C = group.motion(p)
             place = group.place(p)
             for c in ti.static(range(d)):
-                shown[r, c] = place[c]
-                shown[r, d + c] = velocity[c]
+                frame_buffer[r, c] = place[c]
+                frame_buffer[r, d + c] = velocity[c]
             for i in ti.static(range(2 + inner_count)):
-                shown[r, 2 * d + i] = found[i, lane]
+                frame_buffer[r, 2 * d + i] = found[i, lane]
             if affine_at >= 0:
                 for i, j in ti.static(ti.ndrange(d, d)):
-                    shown[r, affine_at + i * d + j] = C[i, j]
+                    frame_buffer[r, affine_at + i * d + j] = C[i, j]
             if gradient_at >= 0:
                 if ti.static(keeps_F):
                     for i, j in ti.static(ti.ndrange(d, d)):
-                        shown[r, gradient_at + i * d + j] = found[2 + inners + i * d + j, lane]
+                        frame_buffer[r, gradient_at + i * d + j] = found[2 + inners + i * d + j, lane]
                 else:
                     # The isotropic F of this volume.
                     stretch = found[1, lane] ** ti.static(1.0 / group.dimension)
                     for i, j in ti.static(ti.ndrange(d, d)):
-                        shown[r, gradient_at + i * d + j] = stretch if ti.static(i == j) else 0.0
+                        frame_buffer[r, gradient_at + i * d + j] = stretch if ti.static(i == j) else 0.0
             if tau_at >= 0:
                 for column in ti.static(range(len(entries))):
-                    shown[r, tau_at + column] = found[2 + inners + d * d + column, lane]
+                    frame_buffer[r, tau_at + column] = found[2 + inners + d * d + column, lane]
             if ti.static(group.comes_and_goes):
-                shown[r, activity_at] = ti.cast(group.activity[p], float)
+                frame_buffer[r, activity_at] = ti.cast(group.activity[p], float)
         begin += LANES
 
 

@@ -107,7 +107,7 @@ class FixedPoint:
         sums = partial(FixedSums, count=grid.runs * grid.node_count, wide=arch in WIDE)
         self.nodes = sums(grid.width)
         self.filling = sums(grid.kept) if grid.keeps_filling else None
-        self.means = tuple(sums(3) if group.averaged else None for group in groups)
+        self.means = tuple(sums(3) if group.uses_f_bar else None for group in groups)
         wide, fine = arch in WIDE, grid.fine
         self.fine = FixedSums(1, grid.runs * fine.node_count, wide=wide) if fine else None
         self.of_fine = self.fine.scale(CROWDED) if fine else 0.0
@@ -190,7 +190,7 @@ class FixedPoint:
         ti.atomic_min(self.beyond[2 * self.run], particle)
 
     @ti.func
-    def settle(self, grid: ti.template(), node: int, relaxed: float):
+    def to_float(self, grid: ti.template(), node: int, relaxed: float):
         """Set the fields of the grid at a node from the sums."""
         d = ti.static(self.dimension)
         value, inverse = self.nodes.value(node), self.pace[self.run][1]

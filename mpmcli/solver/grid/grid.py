@@ -85,9 +85,9 @@ class Grid(LinearNodes):
         holding: `filling`, or else `nodes`.
         means: Vector(3) field per group: of the particles in the cell behind a node the volume at rest times ln J, and
             times what that grew by, and the volume at rest, m^3; None of groups that do not average them
-            (`volume_average`). kept_means: the others.
+            (`transfer.volume`). kept_means: the others.
         opens: (axis, side) of every face that material may leave through: nodes beyond it are like all others.
-        fixed: sums in fixed point, from which `FixedPoint.settle` sets the fields; None where P2G adds to these itself.
+        fixed: sums in fixed point, from which `FixedPoint.to_float` sets fields; None where P2G adds to these itself.
             deterministic: whether there are such sums; then there are no `means`.
         fine: the grid by which particles are shifted (`redistribution.FineGrid`), None where they are not.
         box: (2, d) ints: first node in use and number of nodes in use, per axis. own: the same of a layer, whose rows
@@ -107,15 +107,15 @@ class Grid(LinearNodes):
         *,
         tile: int,
         keeps_filling: bool,
-        averaged: Sequence[bool],
+        uses_f_bar: Sequence[bool],
         period: Period,
         opens: Sequence[tuple[int, int]],
         deterministic: bool,
         layers: int = 1,
     ) -> None:
-        """Allocate nodes for a number of runs; `averaged` says of each group whether it averages volumes over cells."""
+        """Allocate nodes for a number of runs; `uses_f_bar` is whether each group averages volumes over cells."""
         self.dimension, self.kept = dimension, width
-        self.parts = (0, width) if scheme.keeps_before else (0,)
+        self.parts = (0, width) if scheme.keeps_flip_velocity else (0,)
         self.width = width * len(self.parts)
         self.spacing, self.inverse_spacing = spacing, 1 / spacing
         self.gradient_scale = scheme.spline.inverse_moment / spacing
@@ -134,7 +134,7 @@ class Grid(LinearNodes):
         self.filling = ti.Vector.field(width, float, shape=count) if keeps_filling else None
         self.holding = self.filling if keeps_filling else self.nodes
         self.means = tuple(
-            ti.Vector.field(3, float, shape=count) if wanted and not deterministic else None for wanted in averaged
+            ti.Vector.field(3, float, shape=count) if wanted and not deterministic else None for wanted in uses_f_bar
         )
         self.kept_means = tuple(means for means in self.means if means is not None)
         self.period = period

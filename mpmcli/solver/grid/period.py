@@ -68,7 +68,7 @@ class Period:
         return result
 
     @ti.func
-    def settle(self, group: ti.template(), p: int):
+    def wrap(self, group: ti.template(), p: int):
         """Put particle p back into the domain; its remainder takes what rounding would lose (docs/theory.md, 8.3)."""
         for a in ti.static(self.axes):
             after, lost = self.wrapped(group, group.x[p][a], a)

@@ -1,9 +1,18 @@
-"""Memory and passes that a scene needs, known before anything is allocated."""
+"""Memory, passes and time that a scene needs, known before anything is allocated.
+
+Arrays have few sizes: these are a part of kernels, which are found again for other scenes. The time on the CPU, of the
+compilation and of a step, follows from a table of measured kinds. The table is of one machine, see
+`scripts/measure_costs`: it tells which of Taichi's optimisations pay, which depends on ratios alone, and what a run
+takes, to a factor of two.
+"""
 
 import math
+import tomllib
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
 
 import numpy as np
 import psutil
@@ -16,28 +25,122 @@ from mpmcli.materials.law import Law
 from mpmcli.materials.registry import laws
 from mpmcli.plain_text import size_text
 from mpmcli.scene import Scene
-from mpmcli.scene.sampling import count_body, has_expressions
+from mpmcli.scene.sampling import count_body, estimate_body, has_expressions
 from mpmcli.scene.sheets import sheets_of
 from mpmcli.solver.contact.layers import Layers, require_contact_possible
 from mpmcli.solver.contact.surfaces import BodySurfaces
+from mpmcli.solver.contact.total_solids import ParticleContact, bins_along, slips_in
 from mpmcli.solver.drive.forces import forces_on, names_of, needs_initial
-from mpmcli.solver.engine.phases import step_phases
+from mpmcli.solver.engine.step import step_phases
 from mpmcli.solver.frames.columns import FrameColumns
 from mpmcli.solver.grid.fixed_point import FixedPoint
 from mpmcli.solver.grid.grid import Grid, node_width, tile_edge
 from mpmcli.solver.grid.sparse_grid import SparseGrid, require_cpu_if_sparse, room_for_blocks, wants_sparse
-from mpmcli.solver.machine.backend import Backend
-from mpmcli.solver.machine.device_memory import LARGEST_INDEX, MEMORY_SHARE, free_memory
-from mpmcli.solver.machine.room import in_steps, roomy_cells, roomy_colliders
+from mpmcli.solver.machine.backend import LARGEST_INDEX, MEMORY_SHARE, Backend, Optimisation, free_memory
 from mpmcli.solver.particles.arrays import particle_fields
 from mpmcli.solver.particles.sort import TileOrder
-from mpmcli.solver.solids.contact import ParticleContact, bins_along
-from mpmcli.solver.solids.reference_grid import slips_in
 from mpmcli.solver.transfer.kept_motion import keeps_motion
 from mpmcli.solver.transfer.redistribution import fine_nodes
 from mpmcli.solver.transfer.splines import scheme_of
-from mpmcli.solver.transfer.volume_average import averages_volume
-from mpmcli.solver.transfer.volume_relaxation import needs_filling
+from mpmcli.solver.transfer.volume import averages_volume, needs_filling
+
+# Entries, and colliders, up to which there is room for as many.
+FEWEST, FEWEST_COLLIDERS = 1024, 4
+# Cells along an axis are multiples of these in 2D and 3D where they are few, and of the third otherwise.
+FEW_CELLS, FEW_TIMES, CELLS = 64, {2: 16, 3: 8}, 4
+# Entries by which more are off from multiples of powers of two: arrays of such sizes, one after the other, begin in the
+# same set of lines of a cache, and steps in 2D take a fifth longer.
+SKEW = 336
+
+
+def power_of_two(count: int) -> int:
+    """Return the next power of two, at least 1."""
+    return 1 << max(0, count - 1).bit_length()
+
+
+def in_steps(count: int) -> int:
+    """Return room for so many entries, in eighths of a power of two: none, or `FEWEST` at least."""
+    if count > FEWEST:
+        return _multiple(count - SKEW, power_of_two(count - SKEW) // 16) + SKEW
+    return FEWEST if count else 0
+
+
+def padded_cells(cells: Sequence[int]) -> tuple[int, ...]:
+    """Return the cells per axis for which a dense grid has nodes, in sixteenths of a power of two above 64."""
+    few = FEW_TIMES[len(cells)]
+    return tuple(_multiple(n, few if n <= FEW_CELLS else max(CELLS, power_of_two(n) // 32)) for n in cells)
+
+
+def padded_colliders(kind: ColliderKind) -> ColliderKind:
+    count = max(FEWEST_COLLIDERS, power_of_two(kind.count)) if kind.count else 0
+    sizes = {name: in_steps(getattr(kind, name)) for name in ("numbers", "samples", "points")}
+    return replace(kind, count=count, **sizes)
+
+
+def _multiple(count: int, step: int) -> int:
+    return -(-count // max(1, step)) * max(1, step)
+
+
+TABLE = Path(__file__).with_name("costs.toml")
+# Seconds of a compilation that several laws share.
+SHARED = 1.0
+# What threads are worth: the power of their number. Particles that are worth a thread.
+WORTH, WORTH_A_THREAD = 0.9, 2_500
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Seconds to compile, and of a step on one thread."""
+
+    compile: float
+    step: float
+
+    def step_on(self, threads: int) -> float:
+        """Return the seconds of a step on some threads."""
+        return self.step / threads**WORTH
+
+    def seconds(self, steps: int, threads: int) -> float:
+        """Return what so many steps take, compilation included."""
+        return self.compile + steps * self.step_on(threads)
+
+
+@cache
+def _table() -> dict:
+    return tomllib.loads(TABLE.read_text(encoding="utf-8"))
+
+
+def cost_of(scene: Scene, optimisation: Optimisation) -> Cost:
+    """Return the cost of a scene whose kernels get some of Taichi's optimisations; a law of a plugin costs most."""
+    table, axis, h = _table(), scene.dimension - 2, scene.domain.spacing
+    how = "few" if optimisation == "few" else "most"
+    known = {law: entry[how][axis] for law, entry in table["laws"].items()}
+    costs = {s.material.law: known.get(s.material.law, max(known.values())) for s in scene.sources}
+    seconds = SHARED + sum(compiling - SHARED for compiling, _ in costs.values())
+    counts = [estimate_body(body, h) for body in scene.bodies]
+    counts += [sheets_of(emitter, scene).particles for emitter in scene.emitters]
+    step = 1e-9 * sum(n * costs[s.material.law][1] for s, n in zip(scene.sources, counts, strict=True))
+    beside = {
+        "colliders": any(not collider.free for collider in scene.colliders),
+        "rigid": any(collider.free for collider in scene.colliders),
+        "emitters": bool(scene.emitters),
+        "separate": Layers.of(scene).separate,
+    }
+    for name in (name for name, there in beside.items() if there):
+        more, factor = table["beside"][name][axis]
+        seconds, step = seconds + more, step * factor
+    if scene.solver.kernel == "cubic":
+        step *= (4 / 3) ** scene.dimension
+    return Cost(seconds, step)
+
+
+def useful_threads(particles: int, threads: int) -> int:
+    """Return how many of these threads a run of so many particles has use for."""
+    return min(threads, max(1, particles // WORTH_A_THREAD))
+
+
+def cheapest(scene: Scene, steps: int, threads: int) -> Optimisation:
+    """Return which optimisations make a run of so many steps end first."""
+    return min(("few", "most"), key=lambda how: cost_of(scene, how).seconds(steps, threads))
 
 
 def host_bytes_of(scene: Scene, members: Sequence[Law], particles: int, real: int, *, on_cpu: bool) -> int:
@@ -76,14 +179,14 @@ WORDS = {
     "clear": "clear grid",
     "average": "average volumes of {}",
     "scatter": "scatter {}",
-    "settle": "read sums in fixed point",
+    "to_float": "read sums in fixed point",
     "find_bodies": "find bodies that meet",
     "exchange": "let bodies push each other",
     "find_contact": "find contact",
     "find_friction": "find friction",
     "meet": "meet rigid bodies",
     "move_bodies": "move rigid bodies",
-    "book_loads": "add up loads",
+    "add_loads": "add up loads",
     "advance": "gather {}",
 }
 
@@ -192,7 +295,7 @@ def members_of(scene: Scene, law: str) -> list[int]:
 def make_plan(scene: Scene, backend: Backend) -> Plan:
     dimension = scene.dimension
     sparse = wants_sparse(scene) and backend.on_cpu
-    cells = scene.domain.cells if sparse else roomy_cells(scene.domain.cells)
+    cells = scene.domain.cells if sparse else padded_cells(scene.domain.cells)
     real = 8 if backend.precision == "f64" else 4
     width = node_width(dimension, on_cpu=backend.on_cpu)
     bodies = Counter(body.material.law for body in scene.sources)
@@ -206,7 +309,7 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
     ]
     averaged = [averages_volume(scene.solver, law) for law in members]
     require_contact_possible(scene, backend)
-    _require_rigid_possible(scene, backend)
+    _require_rigid_possible(scene)
     fields_of = Layers.of(scene)
     separate, layers, pairs = fields_of.separate, fields_of.count, fields_of.pairs
     groups = tuple(
@@ -217,12 +320,12 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
                 laws()[name],
                 dimension,
                 backend.precision,
-                several=bodies[name] > 1,
+                many_bodies=bodies[name] > 1,
                 keeps_initial=scene.solver.solids == "total"
                 or needs_initial(scene, names_of(scene, members_of(scene, name))),
-                averaged=shares,
+                uses_f_bar=shares,
                 total=scene.solver.solids == "total",
-                slips=slips_in(scene.solver, rough_faces(scene)),
+                has_wall_friction=slips_in(scene.solver, rough_faces(scene)),
                 comes_and_goes=scene.comes_and_goes,
                 surfaced=separate and laws()[name].elastic,
             ),
@@ -231,7 +334,7 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
     )
     # The widest field is a matrix; sources and keys are integers.
     widest = max(size for group in groups for size in group.fields.values())
-    scheme = scheme_of(scene.solver, keeps_before=keeps_motion(scene, members))
+    scheme = scheme_of(scene.solver, keeps_flip_velocity=keeps_motion(scene, members))
     tile = tile_edge(scheme.spline.nodes, dimension, on_cpu=backend.on_cpu)
     all_nodes = nodes = Grid.nodes_needed(cells, tile)
     require_cpu_if_sparse(scene.solver, backend)
@@ -239,7 +342,7 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
         blocks = room_for_blocks(sum(map(in_steps, counts.values())))
         nodes = blocks * tile**dimension
     filling, deterministic = needs_filling(scene, members, layers), scene.solver.deterministic and not backend.on_cpu
-    numbers = layers * width * (1 + scheme.keeps_before + filling)
+    numbers = layers * width * (1 + scheme.keeps_flip_velocity + filling)
     node_bytes = real * (numbers + layers * 3 * sum(averaged))
     # Nothing where that is 0.
     fine = fine_nodes(scene, members) ** dimension
@@ -261,9 +364,9 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
         bins = 2 * math.prod(bins_along(cells))
     rows = all_nodes // (tile * Grid.tile_counts(cells, tile)[-1])
     tables += Loads.bytes_needed(max(1, pairs), dimension, rows) if separate else 0
-    tables += roomy_colliders(ColliderKind.of(scene)).bytes_needed(dimension, rows)
+    tables += padded_colliders(ColliderKind.of(scene)).bytes_needed(dimension, rows)
     if deterministic:
-        tables += nodes * roomy_colliders(ColliderKind.of(scene)).count * dimension * real
+        tables += nodes * padded_colliders(ColliderKind.of(scene)).count * dimension * real
     host_bytes = host_bytes_of(scene, members, sum(counts.values()), real, on_cpu=backend.on_cpu)
     passes = passes_of(members, scene, deterministic=deterministic)
     grid_bytes = nodes * node_bytes + tables
@@ -274,7 +377,7 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
     return Plan(groups, nodes, widest + 8, node_bytes, grid_bytes, host_bytes, passes, backend.arch, sparse, entries)
 
 
-def _require_rigid_possible(scene: Scene, backend: Backend) -> None:
+def _require_rigid_possible(scene: Scene) -> None:
     """Refuse a scene with colliders that move freely, and something that they cannot meet.
 
     Raises:
@@ -282,7 +385,6 @@ def _require_rigid_possible(scene: Scene, backend: Backend) -> None:
     """
     domain = scene.domain
     reasons = {
-        f"with --arch {backend.arch}": not backend.on_cpu,
         "in a domain with periodic walls": any(domain.periodic),
         "beside walls that move": bool(domain.wall_velocity),
         "beside bodies that separate": Layers.of(scene).separate,
@@ -315,7 +417,7 @@ def _contact_bytes(scene: Scene, nodes: int, tile: int, tiles: Sequence[int], re
     return contact + real * scene.dimension * len(rough) * max(rough, default=0)
 
 
-def require_room(plan: Plan) -> None:
+def require_memory(plan: Plan) -> None:
     """Refuse, by an InputError, what exceeds the free memory of this machine or its device, or 32-bit indices."""
     total = plan.machine_bytes
     free = MEMORY_SHARE * psutil.virtual_memory().available

@@ -27,11 +27,11 @@ def particle_fields(
     dimension: int,
     precision: str,
     *,
-    several: bool,
+    many_bodies: bool,
     keeps_initial: bool = False,
-    averaged: bool = False,
+    uses_f_bar: bool = False,
     total: bool = False,
-    slips: bool = False,
+    has_wall_friction: bool = False,
     comes_and_goes: bool = False,
     surfaced: bool = False,
 ) -> dict[str, tuple[type, int, int]]:
@@ -46,11 +46,11 @@ def particle_fields(
         fields["volume_ratio"] = (float, 1, 1)
     fields |= {name: (float, 1, 1) for name in internal}
     fields |= {"initial_position": (float, d, 1)} if keeps_initial else {}
-    fields |= {"volume_to_mean": (float, 1, 1), "cell": (int, 1, 1)} if averaged else {}
-    fields |= {"volume_growth": (float, 1, 1)} if averaged and not total else {}
-    fields |= {"slip": (float, d, 1)} if slips else {}
+    fields |= {"volume_to_mean": (float, 1, 1), "cell": (int, 1, 1)} if uses_f_bar else {}
+    fields |= {"volume_growth": (float, 1, 1)} if uses_f_bar and not total else {}
+    fields |= {"slip": (float, d, 1)} if has_wall_friction else {}
     fields |= {"surface": (float, d + 1, 1)} if surfaced else {}
-    fields |= {"id": (int, 1, 1)} | ({"body": (int, 1, 1)} if several else {})
+    fields |= {"id": (int, 1, 1)} | ({"body": (int, 1, 1)} if many_bodies else {})
     return fields | ({"activity": (int, 1, 1)} if comes_and_goes else {})
 
 
@@ -77,23 +77,23 @@ class ParticleArrays:
         J_minus_1: J - 1, (n); None where the law keeps F. Both are stored as the difference from rest: a step adds
             strains of 1e-6 and less, which single precision would round off next to 1.
         internal: the law's internal variables, (n) each; id: (n) int, row of the particle in every frame.
-        body: (n) int, row of its body in the table; None unless particles may belong to `several` bodies.
+        body: (n) int, row of its body in the table; None unless particles may belong to `many_bodies`.
         serial: whether loops that copy particles from and to the host run on one thread, which few particles need.
-        total: whether the body is on the grid of its state at rest, see `reference_grid`.
+        total: whether the body is on the grid of its state at rest, see `total_solids`.
         initial: position at the start as x, (n) Vector(d), m, of groups that keep it (`keeps_initial`) for a force, or
             since they are `total`.
-        averaged: whether particles of a cell share their change of volume (`volume_average`): then each has its `cell`,
-            (n), and `to_mean`, (n), ln J during P2G, and where a frame is read what it lacks to the mean of its cell.
+        uses_f_bar: whether particles of a cell share their change of volume (`transfer.volume`): then each has its
+            `cell`, (n), and `to_mean`, (n), ln J during P2G, and for a frame what it lacks to the mean of its cell.
         growth: by which ln J of such a particle grew in the last step, (n); None unless the group is `evened`: where
             particles change cells they take the mean growth of their cell in G2P.
         slip: how far a particle has slipped on the wall that pushes it, (n) Vector(d), m, where there is friction
-            (`slips`), see `reference_grid`.
+            (`has_wall_friction`), see `total_solids`.
         carried: (n) Vector(d + 1), the normal to the nearest face of the body at rest, and the depth below it, m, of
             groups whose bodies may have layers of their own (`surfaced`), see `contact.surfaces`.
         layers: of the grid; layer: per row of the table, the layer of nodes of its body.
         activity: (n) int, whether each waits, takes part or has left (`particles.sort`); None where all take part
             always (`comes_and_goes` is false).
-        force: what acts on the particles of groups that are `pushed`; run: number of the run that a view is for.
+        force: what acts on the particles where the group `has_body_force`; run: number of the run that a view is for.
         table: per body a row of particle mass, particle volume and the constants of the law; kept: per body the share
             that it keeps of its motion in this step, see `kept_motion`; real: numpy's type.
     """
@@ -105,12 +105,12 @@ class ParticleArrays:
         count: int,
         table: tuple[int, int],
         *,
-        several: bool,
+        many_bodies: bool,
         serial: bool,
         keeps_initial: bool = False,
         total: bool = False,
-        averaged: bool = False,
-        slips: bool = False,
+        uses_f_bar: bool = False,
+        has_wall_friction: bool = False,
         comes_and_goes: bool = False,
         layers: int = 1,
         surfaced: bool = False,
@@ -120,20 +120,20 @@ class ParticleArrays:
         self.dimension = d = dimension
         self.real = np.float64 if ti.lang.impl.current_cfg().default_fp == ti.f64 else np.float32
         self.carries = self.real == np.float32
-        self.several, self.serial, self.total, self.averaged = several, serial, total, averaged
-        self.keeps_initial, self.evened = keeps_initial or total, averaged and not total
-        self.slips, self.comes_and_goes = slips, comes_and_goes
+        self.many_bodies, self.serial, self.total, self.uses_f_bar = many_bodies, serial, total, uses_f_bar
+        self.keeps_initial, self.evened = keeps_initial or total, uses_f_bar and not total
+        self.has_wall_friction, self.comes_and_goes = has_wall_friction, comes_and_goes
         self.layers, self.surfaced = layers, surfaced
         wanted = particle_fields(
             law.deformation,
             names := [variable.name for variable in law.internal],
             d,
             "f32" if self.carries else "f64",
-            several=several,
+            many_bodies=many_bodies,
             keeps_initial=self.keeps_initial,
-            averaged=averaged,
+            uses_f_bar=uses_f_bar,
             total=total,
-            slips=slips,
+            has_wall_friction=has_wall_friction,
             comes_and_goes=comes_and_goes,
             surfaced=self.surfaced,
         )
@@ -144,7 +144,7 @@ class ParticleArrays:
         self.initial, self.slip, self.carried = (made.get(name) for name in ("initial_position", "slip", "surface"))
         self.cell, self.to_mean, self.growth = (made.get(name) for name in ("cell", "volume_to_mean", "volume_growth"))
         self.id, self.body, self.activity = made["id"], made.get("body"), made.get("activity")
-        self.pushed, self.force, self.run = False, None, 0
+        self.has_body_force, self.force, self.run = False, None, 0
         self.repeats = False
         self.period: Period | None = None
         self.table = ti.Vector.field(table[1], float, shape=table[0])
@@ -154,7 +154,7 @@ class ParticleArrays:
         self.spare = ti.field(float, shape=SPARE)
 
     def push_by(self, force: object) -> None:
-        self.pushed, self.force = True, force
+        self.has_body_force, self.force = True, force
 
     def repeat(self, period: Period) -> None:
         self.period, self.repeats = period, len(period.axes) > 0
@@ -188,7 +188,11 @@ class ParticleArrays:
     def fields(self) -> dict[str, ti.Field]:
         """Return every field of the particles that changes during a run or is sorted, by name."""
         names = ["position", "velocity", "velocity_gradient", "deformation", *(v.name for v in self.law.internal)]
-        initial = ["initial_position"] * self.keeps_initial + ["slip"] * self.slips + ["volume_growth"] * self.evened
+        initial = (
+            ["initial_position"] * self.keeps_initial
+            + ["slip"] * self.has_wall_friction
+            + ["volume_growth"] * self.evened
+        )
         initial += ["surface"] * self.surfaced
         labels = ["id"] + ["body"] * (self.body is not None) + ["activity"] * self.comes_and_goes
         return dict(zip([*names, *initial, *labels], (*self.state, *self.labels), strict=True))
@@ -259,7 +263,7 @@ class ParticleArrays:
                 reals[q, start + self._deformation_width + i] = self.internal[i][p]
             labels[q, 0] = self.id[p]
             # Every entry is written: a GPU does not get the zeros of the host.
-            if ti.static(self.several):
+            if ti.static(self.many_bodies):
                 labels[q, 1] = self.body[p]
             else:
                 labels[q, 1] = 0
@@ -293,7 +297,7 @@ class ParticleArrays:
             if ti.static(self.keeps_initial):
                 for c in ti.static(range(d)):
                     self.initial[p][c] = reals[q, start + self._deformation_width + ti.static(len(self.internal)) + c]
-            if ti.static(self.slips):
+            if ti.static(self.has_wall_friction):
                 for c in ti.static(range(d)):
                     self.slip[p][c] = 0.0
             if ti.static(self.evened):
@@ -302,7 +306,7 @@ class ParticleArrays:
                 for c in ti.static(range(d + 1)):
                     self.carried[p][c] = reals[q, reals.shape[1] - ti.static(d + 1) + c]
             self.id[p] = labels[q, 0]
-            if ti.static(self.several):
+            if ti.static(self.many_bodies):
                 self.body[p] = labels[q, 1]
             if ti.static(self.comes_and_goes):
                 self.activity[p] = labels[q, 2]
@@ -321,7 +325,7 @@ class ParticleArrays:
     @ti.func
     def seen(self, p: int):
         """Return what the law sees of the deformation of particle p, where a frame is read."""
-        if ti.static(self.averaged):
+        if ti.static(self.uses_f_bar):
             return self.stored(p) * exp(self.to_mean[p] * ti.static(1.0 / self.dimension))
         else:
             return self.stored(p)
@@ -401,7 +405,7 @@ class ParticleArrays:
     @ti.func
     def row_number(self, p: int):
         row = 0
-        if ti.static(self.several):
+        if ti.static(self.many_bodies):
             row = self.body[p]
         return row
 

@@ -35,7 +35,7 @@ class SortBuffers:
     """Scratch memory of the sort, shared by all groups.
 
     Attributes:
-        room: particles of the largest group of one run.
+        capacity: particles of the largest group of one run.
         order: (n) int, where the particle at each new place comes from.
         key: (n) int, tile of each particle; also the scratch of integer fields.
         real: (n w) scratch of real fields; widest: w, the largest number of entries of a particle in one of them, or
@@ -44,7 +44,7 @@ class SortBuffers:
 
     def __init__(self, groups: Sequence[ParticleArrays], runs: int = 1) -> None:
         n = max(group.capacity for group in groups)
-        self.room = n // runs
+        self.capacity = n // runs
         self.widest = max(len(groups), *(entry_count(field) for group in groups for field in group.state))
         self.order = ti.field(int, shape=n)
         self.key = ti.field(int, shape=n)
@@ -52,12 +52,12 @@ class SortBuffers:
 
 
 @ti.func
-def scratch_offset(buffers: ti.template(), g: ti.template(), w: int, room: ti.template()):
+def scratch_offset(buffers: ti.template(), g: ti.template(), w: int, capacity: ti.template()):
     """Return what to add to the number of a particle for a place in `SortBuffers.real` that no other has.
 
-    g: its group; w: its run; room: particles of a run in the group.
+    g: its group; w: its run; capacity: particles of a run in the group.
     """
-    return w * ti.static(buffers.room * buffers.widest - room) + ti.static(g * buffers.room)
+    return w * ti.static(buffers.capacity * buffers.widest - capacity) + ti.static(g * buffers.capacity)
 
 
 @ti.data_oriented
@@ -96,10 +96,10 @@ class TileOrder:
         return base
 
     @ti.func
-    def settle(self, p: int):
+    def wrap(self, p: int):
         """Put particle p back into the domain where that repeats."""
         if ti.static(len(self.grid.period.axes) > 0):
-            self.grid.period.settle(self.group, p)
+            self.grid.period.wrap(self.group, p)
 
     @ti.func
     def tile_of(self, p: int):
@@ -197,12 +197,12 @@ def stay_rolled(scratch: ti.template(), index: int):
 @ti.func
 def count_tiles(order: ti.template(), run: int, t: int, first: int, begin: int, end: int):
     """Count the particles of each tile in share t of those of a run, which begin at `first`: from `begin` to `end`."""
-    cursor, own = run * ti.static(order.bins), run * ti.static(order.buffers.room)
+    cursor, own = run * ti.static(order.bins), run * ti.static(order.buffers.capacity)
     for tile in range(order.bins):
         stay_rolled(order.buffers.real, cursor + tile)
         order.cursor[cursor + tile, t] = 0
     for q in range(begin, end):
-        order.settle(first + q)
+        order.wrap(first + q)
         tile = order.bin_of(first + q)
         stay_rolled(order.buffers.real, tile)
         order.buffers.key[own + q] = tile
@@ -226,7 +226,7 @@ def find_places(order: ti.template(), run: int, first: int):
 @ti.func
 def place_particles(order: ti.template(), run: int, t: int, first: int, begin: int, end: int):
     """Note, at the place of each particle of a share, where it comes from; see `count_tiles`."""
-    cursor, own = run * ti.static(order.bins), run * ti.static(order.buffers.room)
+    cursor, own = run * ti.static(order.bins), run * ti.static(order.buffers.capacity)
     for q in range(begin, end):
         tile = cursor + order.buffers.key[own + q]
         stay_rolled(order.buffers.real, tile)

@@ -37,7 +37,7 @@ from mpmcli.solver.transfer.particle_step import Loads, NodeSums, Receiver, Send
 from mpmcli.solver.transfer.particle_update import SMALLEST_J, scatter_volume
 from mpmcli.solver.transfer.splines import bounded
 from mpmcli.solver.transfer.stencils import add_linear, gather_linear
-from mpmcli.solver.transfer.volume_average import average_range, missing_growth
+from mpmcli.solver.transfer.volume import average_range, missing_growth
 
 
 @ti.func
@@ -56,20 +56,26 @@ def scatter_range(
     deformation, internal = zero_lanes(ti.static(stored_entries(group))), zero_lanes(inners)
     rows, ratios = zero_lanes(ti.static(group.table.n)), ti.Vector.zero(float, LANES)
     shares, missing = ti.Vector.zero(float, LANES), ti.Vector.zero(float, LANES)
-    pushes = zero_lanes(ti.static(d + d * d if group.pushed else 1))
-    touches = zero_lanes(ti.static(d if particles.touches else 1))
-    frictions = zero_lanes(ti.static(d if group.slips else 1))
-    loaded = ti.static(group.averaged or particles.touches or group.slips or group.pushed or grid.scheme.keeps_before)
+    pushes = zero_lanes(ti.static(d + d * d if group.has_body_force else 1))
+    touches = zero_lanes(ti.static(d if particles.has_contact else 1))
+    frictions = zero_lanes(ti.static(d if group.has_wall_friction else 1))
+    loaded = ti.static(
+        group.uses_f_bar
+        or particles.has_contact
+        or group.has_wall_friction
+        or group.has_body_force
+        or grid.scheme.keeps_flip_velocity
+    )
     first_node, behind = ti.Vector.zero(int, LANES), ti.Vector.zero(int, LANES)
     weights = zero_lanes(ti.static(nodes * d))
     middles, changes = ti.Matrix.zero(float, LANES, width), ti.Matrix.zero(float, LANES, ti.static(d * width))
-    if ti.static(not group.several):
+    if ti.static(not group.many_bodies):
         load_rows(group, first, 1, rows)
     begin = first
     while begin < last:
         count = ti.min(LANES, last - begin)
         load_lanes(group, begin, count, affine, deformation, internal)
-        if ti.static(group.several):
+        if ti.static(group.many_bodies):
             load_rows(group, begin, count, rows)
         origin = bounded(begin)
         load_vectors(places, group.place_on_grid, origin)
@@ -198,7 +204,7 @@ def advance_range(
     weights = zero_lanes(ti.static(nodes * d))
     velocities, moments = ti.Matrix.zero(float, LANES, width), ti.Matrix.zero(float, LANES, ti.static(d * width))
     # Of particles whose body keeps a share of its motion.
-    keeps = ti.static(grid.scheme.keeps_before)
+    keeps = ti.static(grid.scheme.keeps_flip_velocity)
     kept = ti.static(grid.kept if keeps else 0)
     own_speeds, own_affine = zero_lanes(ti.static(d if keeps else 1)), zero_lanes(ti.static(d * d if keeps else 1))
     shares, missing = ti.Vector.zero(float, LANES), ti.Vector.zero(float, LANES)
@@ -206,7 +212,7 @@ def advance_range(
     beyond, rates, growths = ti.Vector.zero(float, LANES), ti.Vector.zero(float, LANES), zero_lanes(1)
     rows = zero_lanes(ti.static(group.table.n if group.law.grows_by_constants else CONSTANTS + 1))
     sharpest = NOTHING
-    if ti.static(group.law.grows_by_constants and not group.several):
+    if ti.static(group.law.grows_by_constants and not group.many_bodies):
         load_rows(group, first, 1, rows)
     begin = first
     while begin < last:
@@ -223,7 +229,7 @@ def advance_range(
             load_vectors(own_speeds, group.v, origin)
             for c, a in ti.static(ti.ndrange(d, d)):
                 load_entry(own_affine, c * d + a, group.gradient, (a, c), origin)
-        if ti.static(group.law.grows_by_constants and group.several):
+        if ti.static(group.law.grows_by_constants and group.many_bodies):
             load_rows(group, begin, count, rows)
         if count < LANES:
             repeat_first(places, count)
@@ -391,6 +397,30 @@ def update_rows(at: ti.template(), first: int, last: int, gravity_step: ti.templ
                 speed_squared = squared
             node[d - 1] += 1
     return speed_squared
+
+
+@ti.func
+def nodes_of_rows(at: ti.template(), first: int, last: int, kick: float):
+    """Do what a phase says for each node in rows first to last - 1 of the box in use."""
+    for row in range(first, last):
+        node = at.grid.row_start(row)
+        for _ in range(at.grid.row_length(node)):
+            ti.static(at.item)(at, node, kick)
+            node[ti.static(at.grid.dimension - 1)] += 1
+
+
+@ti.func
+def nodes_of_blocks(at: ti.template(), first: int, after: int, kick: float):
+    """Do what a phase says for each node of blocks `first` to `after` - 1."""
+    grid, d = ti.static((at.grid, at.grid.dimension))
+    for b in range(first, after):
+        node = grid.tile_place(grid.tile_at[b])
+        place = node
+        for q in range(ti.static(grid.block)):
+            for a in ti.static(range(d)):
+                along = q // ti.static(grid.tile ** (d - 1 - a)) % ti.static(grid.tile)
+                node[a] = place[a] * ti.static(grid.tile) + along
+            ti.static(at.item)(at, node, kick)
 
 
 @ti.func

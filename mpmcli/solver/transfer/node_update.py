@@ -106,7 +106,7 @@ class NodeUpdate:
 
                 # Unfold.
                 self.write(0, node, index, kind, place, velocity)
-                if ti.static(self.grid.scheme.keeps_before):
+                if ti.static(self.grid.scheme.keeps_flip_velocity):
                     self.update_before(node, index, kind, place)
                 for a in ti.static(range(d)):
                     speed_squared += velocity[a] ** 2

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from mpmcli.quick_taichi import ti
+from mpmcli.solver.contact.total_solids import friction_of_walls, pulled_back, push_of_walls
 from mpmcli.solver.particles.arrays import MASS, VOLUME
 from mpmcli.solver.particles.state_bounds import deformation_rate, volume_growth
-from mpmcli.solver.solids.reference_grid import friction_of_walls, pulled_back, push_of_walls
-from mpmcli.solver.transfer.volume_average import even, log_volume, missing_to_mean, stretch_to
+from mpmcli.solver.transfer.volume import even, log_volume, missing_to_mean, stretch_to
 
 
 @dataclass(frozen=True)
@@ -98,15 +98,15 @@ def loads_on(particles: ti.template(), g: ti.template(), group: ti.template(), p
     d = ti.static(group.dimension)
     share, missing, slope = 0.0, 0.0, ti.Matrix.zero(float, d, d)
     push, touch, friction = ti.Vector.zero(float, d), ti.Vector.zero(float, d), ti.Vector.zero(float, d)
-    if ti.static(particles.grid.scheme.keeps_before):
+    if ti.static(particles.grid.scheme.keeps_flip_velocity):
         share = group.kept[group.row_number(p)]
-    if ti.static(group.averaged):
+    if ti.static(group.uses_f_bar):
         missing = missing_to_mean(particles.grid, g, group, p)
-    if ti.static(group.pushed):
+    if ti.static(group.has_body_force):
         push, slope = group.force.acceleration(group, p, group.force.spreads)
-    if ti.static(particles.touches):
+    if ti.static(particles.has_contact):
         touch = particles.contact.push(group, p, particles.grid.spacing, particles.run)
-    if ti.static(group.slips):
+    if ti.static(group.has_wall_friction):
         friction = friction_of_walls(particles, group, p, kick, counts)
     return share, missing, push, slope, touch, friction
 
@@ -127,22 +127,22 @@ def hand_over(particles: ti.template(), group: ti.template(), own: ti.template()
     """
     grid, d = ti.static((particles.grid, group.dimension))
     seen, stretch = own.state, 1.0
-    if ti.static(group.averaged):
+    if ti.static(group.uses_f_bar):
         stretch = stretch_to(own.loads.missing, d)
         seen *= stretch
     stress, _, plastic, inner = group.law.respond(seen, own.inner, own.C, kick, own.constants)
     if ti.static(group.law.projects):
         plastic -= seen
-        if ti.static(group.averaged):
+        if ti.static(group.uses_f_bar):
             plastic /= stretch
     v, C = own.v, own.C
-    if ti.static(group.pushed):
+    if ti.static(group.has_body_force):
         v += kick * own.loads.push
         C += kick * own.loads.slope
     if ti.static(group.total):
-        if ti.static(particles.touches):
+        if ti.static(particles.has_contact):
             v += kick * own.loads.touch
-        if ti.static(group.slips):
+        if ti.static(group.has_wall_friction):
             v += kick * own.loads.friction
         v += kick * push_of_walls(particles, group, own.here, own.place, own.state, own.row, own.constants)
         # Entry by entry: Taichi loses matrices that are assigned as a whole here.
@@ -151,7 +151,7 @@ def hand_over(particles: ti.template(), group: ti.template(), own: ti.template()
             C[i, j] = at_rest[i, j]
             stress[i, j] = nominal[i, j]
     middle, change = momentum(grid, distance, own.row[MASS], own.row[VOLUME], v, C, stress, kick)
-    if ti.static(grid.scheme.keeps_before):
+    if ti.static(grid.scheme.keeps_flip_velocity):
         kept = own.C
         if ti.static(group.total):
             kept = own.C @ own.state
@@ -186,7 +186,7 @@ def take_back(
         F += after
         C = C @ F.inverse()
     v, affine = sums.velocity, C
-    if ti.static(grid.scheme.keeps_before):
+    if ti.static(grid.scheme.keeps_flip_velocity):
         C_before = centred(grid, sums.distance, sums.old_velocity, sums.old_moment).transpose()
         own_C = own.C
         if ti.static(group.total):

@@ -5,16 +5,15 @@ from copy import copy
 
 from mpmcli.boundaries.walls import MovingFaces, RoughFaces
 from mpmcli.quick_taichi import ti
+from mpmcli.solver.contact.total_solids import ParticleContact
 from mpmcli.solver.grid.grid import Grid, LinearNodes
 from mpmcli.solver.grid.period import opaque
 from mpmcli.solver.particles.arrays import MASS, VOLUME
 from mpmcli.solver.particles.state_bounds import deformation_rate, volume_ratio
-from mpmcli.solver.solids.contact import ParticleContact
 from mpmcli.solver.transfer.particle_step import Loads, NodeSums, Receiver, Sender, hand_over, loads_on, take_back
 from mpmcli.solver.transfer.splines import PAD
 from mpmcli.solver.transfer.stencils import add_linear, columns, gather_linear
-from mpmcli.solver.transfer.volume_average import missing_growth
-from mpmcli.solver.transfer.volume_relaxation import relax_volume
+from mpmcli.solver.transfer.volume import missing_growth, relax_volume
 
 
 @ti.func
@@ -63,7 +62,7 @@ class ParticleUpdate:
     Attributes:
         near: the nodes that stencils find: those of the grid, or on a sparse one those of a window.
         extent: size of the domain, m; last: node of the upper walls, per axis; faces: words of the walls, per axis.
-        contact: between elastic bodies that are `total`; touches: whether there is any.
+        contact: between elastic bodies that are `total`; has_contact: whether there is any.
         friction, moving: coefficients and velocities of the walls; run: number of the run that a view is for.
         watches_box: whether a particle whose stencil has left the nodes in use is lost: on a GPU, where speeds are not
             read back at every step.
@@ -82,7 +81,7 @@ class ParticleUpdate:
         *,
         watches_box: bool,
     ) -> None:
-        self.contact, self.touches, self.friction, self.moving = contact, contact is not None, friction, moving
+        self.contact, self.has_contact, self.friction, self.moving = contact, contact is not None, friction, moving
         self.grid = self.near = grid
         self.dimension, self.run, self.first_lost = grid.dimension, 0, 0
         self.faces = tuple(tuple(pair) for pair in faces)
@@ -147,14 +146,14 @@ class ParticleUpdate:
                 remainder[c] = group.gradient[p][c, d]
         if ti.static(group.evened):
             missing = missing_growth(grid, g, group, p)
-        if ti.static(grid.scheme.keeps_before):
+        if ti.static(grid.scheme.keeps_flip_velocity):
             share = group.kept[group.row_number(p)]
         deformation, constants = group.deformation(p), group.constants(p)
         base, distance = grid.scheme.spline.stencil(group.on_grid(p), grid.inverse_spacing)
         w = grid.scheme.spline.weights(distance)
         all_sums, moments = gather_linear(grid.nodes, grid, grid.linear_index(base), w)
         velocity, moment = columns(all_sums, moments, 0, d)
-        kept = ti.static(grid.kept if grid.scheme.keeps_before else 0)
+        kept = ti.static(grid.kept if grid.scheme.keeps_flip_velocity else 0)
         old_velocity, old_moment = columns(all_sums, moments, kept, d)
         (own,) = ti.static((Receiver(x, remainder, v, C, deformation, constants, share, missing),))
         (sums,) = ti.static((NodeSums(distance, velocity, moment, old_velocity, old_moment),))

@@ -18,9 +18,8 @@ from mpmcli.materials.law import Law
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
 from mpmcli.scene.sampling import points_per_cell
-from mpmcli.solver.grid.blocks import BlockNodes
 from mpmcli.solver.grid.grid import Grid, LinearNodes
-from mpmcli.solver.grid.sparse_grid import SparseGrid
+from mpmcli.solver.grid.sparse_grid import BlockNodes, SparseGrid
 from mpmcli.solver.particles.arrays import MASS, VOLUME
 from mpmcli.solver.transfer.lanes import (
     LANES,
@@ -35,7 +34,7 @@ from mpmcli.solver.transfer.lanes import (
 )
 from mpmcli.solver.transfer.splines import PAD, SPLINES, TransferScheme, bounded
 from mpmcli.solver.transfer.stencils import add_linear, gather_linear, node_of, origin_of
-from mpmcli.solver.transfer.volume_relaxation import image_along
+from mpmcli.solver.transfer.volume import image_along
 from mpmcli.stability.transfer_factors import FARTHEST
 
 # Share of a crowd's slope that a particle follows: 8 times the strain since the last shift, 1 for large strains.
@@ -151,7 +150,7 @@ def fill_range(at: ti.template(), first: int, last: int, time: float):
 
 
 @ti.func
-def settle_fine(at: ti.template(), node: ti.template(), time: float):
+def fine_to_float(at: ti.template(), node: ti.template(), time: float):
     """Read sums in fixed point."""
     for q in range(ti.static(at.grid.fine.in_cell)):
         index = at.grid.fine.linear_index(at.grid.fine.place_in_cell(node, q))
@@ -359,11 +358,11 @@ def add_shift(at: ti.template(), first: ti.template(), w: ti.template(), mass: f
 
 
 @ti.func
-def settle_shift(at: ti.template(), node: ti.template(), time: float):
+def shift_to_float(at: ti.template(), node: ti.template(), time: float):
     """Read sums in fixed point."""
     (grid,) = ti.static((at.grid,))
     index = grid.linear_index(node)
-    grid.fixed.settle(grid, index, 0.0)
+    grid.fixed.to_float(grid, index, 0.0)
     for a in ti.static(range(grid.dimension)):
         grid.nodes[index][a] *= grid.spacing / grid.fixed.pace[grid.fixed.run][2]
 

@@ -79,21 +79,21 @@ SPLINES = {"quadratic": QuadraticSpline(), "cubic": CubicSpline()}
 class TransferScheme:
     """Constants of the transfers between particles and nodes.
 
-    keeps_before: whether nodes also store mass and momentum, without this step's stress and forces, of the shares that
-    bodies keep (`kept_motion`); damped: share of what nodes do not see that a body loses in a step of its own, less
-    than 1 with AFLIP.
+    keeps_flip_velocity: whether nodes also store mass and momentum, without this step's stress and forces, of the
+    shares that bodies keep (`kept_motion`); damped: share of what nodes do not see that a body loses in a step of its
+    own, less than 1 with AFLIP.
     """
 
     spline: QuadraticSpline | CubicSpline
-    keeps_before: bool = False
+    keeps_flip_velocity: bool = False
     damped: float = 1.0
 
     @property
     def plain(self) -> bool:
         """Whether splines are quadratic and nodes store one momentum."""
-        return self.spline.nodes == 3 and not self.keeps_before
+        return self.spline.nodes == 3 and not self.keeps_flip_velocity
 
 
-def scheme_of(settings: SolverSettings, *, keeps_before: bool) -> TransferScheme:
+def scheme_of(settings: SolverSettings, *, keeps_flip_velocity: bool) -> TransferScheme:
     damped = 1 - (settings.flip or 0.0)
-    return TransferScheme(SPLINES[settings.kernel], keeps_before, damped)
+    return TransferScheme(SPLINES[settings.kernel], keeps_flip_velocity, damped)

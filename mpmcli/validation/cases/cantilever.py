@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mpmcli.scene import Scene
-from mpmcli.validation.case import Case, Frames, Levels, Measure, case_text
-from mpmcli.validation.measuring import after_ramp, field
-from mpmcli.validation.tables import Tables, body, box, elastic, problem, smooth_ramp
+from mpmcli.validation.case import Case, Frames, Levels, Measure, Tables, case_text
+from mpmcli.validation.shared import after_ramp, body, box, elastic, field, problem, smooth_ramp
 
 if TYPE_CHECKING:
     from scipy.integrate import OdeSolution
@@ -41,21 +40,20 @@ class Beam:
         moment = brentq(lambda moment: self._shoot(moment)(1.0)[3], 0.0, highest, xtol=1e-15)
         return self._shoot(moment)
 
-    def _slopes(self, s: float, state: np.ndarray) -> tuple[float, ...]:
-        """Return d(x, y, theta, M)/ds."""
-        _, _, theta, moment = state
-        f = self.load * min((1 - s) / self.spread if self.spread else 1.0, 1.0)
-        c, d = math.cos(theta), math.sin(theta)
-        along, across = 1 + f * d / self.axial, f * c / self.shear
-        x = along * c - across * d
-        return x, along * d + across * c, moment, -x * f
-
     def _shoot(self, moment: float) -> "OdeSolution":
         from scipy.integrate import solve_ivp
 
-        clamp = (0.0, 0.0, 0.0, moment)
+        def slopes(s: float, state: np.ndarray) -> tuple[float, ...]:
+            """Return d(x, y, theta, M)/ds."""
+            _, _, theta, moment = state
+            f = self.load * min((1 - s) / self.spread if self.spread else 1.0, 1.0)
+            c, d = math.cos(theta), math.sin(theta)
+            along, across = 1 + f * d / self.axial, f * c / self.shear
+            x = along * c - across * d
+            return x, along * d + across * c, moment, -x * f
+
         accuracy = {"method": "DOP853", "rtol": 1e-13, "atol": 1e-16, "max_step": 0.02}
-        return solve_ivp(self._slopes, (0.0, 1.0), clamp, dense_output=True, **accuracy).sol
+        return solve_ivp(slopes, (0.0, 1.0), (0.0, 0.0, 0.0, moment), dense_output=True, **accuracy).sol
 
 
 LENGTH, THICKNESS, YOUNG, DENSITY = 5.0, 1.0, 1e6, 1000.0
@@ -159,6 +157,3 @@ class TotalBend(LargeBend):
         Measure(f"tip error: {TIP}", lambda n: 1.2 * (0.17 / n**2 + 0.0025), order=1.6, expected=2.0, order_to=4),
         THIN,
     )
-
-
-CASES = (SmallBend(), LargeBend(), TotalBend())

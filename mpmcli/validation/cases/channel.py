@@ -6,9 +6,8 @@ from collections.abc import Callable
 import numpy as np
 
 from mpmcli.scene import Scene
-from mpmcli.validation.case import Case, Frames, Measure, case_text
-from mpmcli.validation.measuring import field
-from mpmcli.validation.tables import Tables, body, box, fluid, problem
+from mpmcli.validation.case import Case, Frames, Measure, Tables, case_text
+from mpmcli.validation.shared import body, box, field, fluid, problem
 
 # Distance of the walls, m; density, kg/m^3; kinematic viscosity, m^2/s; the pull, m/s^2; and the speed of a wall, m/s.
 WIDTH, DENSITY, VISCOSITY, PULL, SPEED = 1.0, 1000.0, 1.0, 0.5, 0.5
@@ -174,6 +173,3 @@ class Couette(Case):
             "cross flow": float(np.abs(v).max()) / SPEED,
             "unevenness": max(float(np.ptp(u[y == height])) for height in np.unique(y)) / SPEED,
         }
-
-
-CASES = (Poiseuille(), Bingham(), Couette())

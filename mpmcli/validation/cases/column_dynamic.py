@@ -5,9 +5,8 @@ import math
 import numpy as np
 
 from mpmcli.scene import Scene
-from mpmcli.validation.case import Case, Frames, case_text
-from mpmcli.validation.measuring import field, fit_oscillation
-from mpmcli.validation.tables import Tables, body, elastic, problem, shaft
+from mpmcli.validation.case import Case, Frames, Tables, case_text
+from mpmcli.validation.shared import body, elastic, field, fit_oscillation, problem, shaft
 
 HEIGHT, YOUNG, DENSITY, GRAVITY = 1.0, 1e6, 1000.0, 1.0
 WAVE_SPEED = math.sqrt(YOUNG / DENSITY)
@@ -79,6 +78,3 @@ class ColumnDynamic(Case):
             "peak error": extreme(np.array(times[first]), np.array(tops[first])) / PEAK - 1,
             "period error": 2 * math.pi / wave.frequency / PERIOD - 1,
         }
-
-
-CASES = (ColumnDynamic(),)

@@ -5,9 +5,8 @@ import math
 import numpy as np
 
 from mpmcli.scene import Scene
-from mpmcli.validation.case import Case, Frames, Measure, case_text
-from mpmcli.validation.measuring import after_ramp, field
-from mpmcli.validation.tables import Tables, body, elastic, problem, shaft, smooth_ramp
+from mpmcli.validation.case import Case, Frames, Measure, Tables, case_text
+from mpmcli.validation.shared import after_ramp, body, elastic, field, problem, shaft, smooth_ramp
 
 HEIGHT, DENSITY, GRAVITY = 50.0, 80.0, 10.0
 WEIGHT = DENSITY * GRAVITY

@@ -5,9 +5,8 @@ import math
 import numpy as np
 
 from mpmcli.scene import Scene
-from mpmcli.validation.case import Case, Frames, Levels, case_text
-from mpmcli.validation.measuring import field
-from mpmcli.validation.tables import Tables, ball, body, box, elastic, problem
+from mpmcli.validation.case import Case, Frames, Levels, Tables, case_text
+from mpmcli.validation.shared import ball, body, box, elastic, field, problem
 
 FRAMES = 200
 DENSITY, YOUNG, POISSON = 1000.0, 1e4, 0.3

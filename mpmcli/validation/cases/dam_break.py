@@ -1,4 +1,4 @@
-"""A column of water that is let go, beside three measured ones (Martin and Moyce 1952): validation."""
+"""Dam breaks beside measured ones: columns (Martin and Moyce 1952), and an obstacle (Kleefsman et al. 2005)."""
 
 import math
 from collections.abc import Sequence
@@ -9,8 +9,8 @@ from typing import Literal
 import numpy as np
 
 from mpmcli.scene import Scene
-from mpmcli.validation.case import Case, Frames, case_text
-from mpmcli.validation.tables import Tables, body, box, fluid, problem, reference_data
+from mpmcli.validation.case import Case, Frames, Tables, case_text
+from mpmcli.validation.shared import body, box, fluid, problem, reference_data
 
 # Range of T that is compared. Earlier the column is nearly at rest; later friction slows the thin front.
 FIRST, LAST = 1.0, 4.0
@@ -19,9 +19,9 @@ N_SQUARED = 2.0
 # Candidate time shifts, in units of T.
 SHIFTS = np.linspace(0.0, 0.6, 121)
 # a of the larger column, m.
-WIDTH = 0.05715
+COLUMN = 0.05715
 GRAVITY, DENSITY = 9.81, 1000.0
-# The front is where all but this share of the water is behind: what is left is a film thinner than a particle.
+# The front is where all but this share of the water is behind: what is left are drops and a film.
 FILM = 0.001
 # The height at the back is that of the highest water within this part of the width.
 BACK = 1 / 8
@@ -33,8 +33,6 @@ class Series:
 
     name: str
     quantity: Literal["front", "height"]
-    width: float
-    source: str
     T: np.ndarray
     value: np.ndarray
 
@@ -45,7 +43,7 @@ def measured(quantity: Literal["front", "height"]) -> tuple[Series, ...]:
     found = []
     for row in reference_data("martin_moyce")["series"]:
         T = np.array(row["T"]) if "T" in row else math.sqrt(N_SQUARED) * np.array(row["tau"])
-        found.append(Series(row["name"], row["quantity"], row["width"], row["source"], T, np.array(row["value"])))
+        found.append(Series(row["name"], row["quantity"], T, np.array(row["value"])))
     return tuple(series for series in found if series.quantity == quantity)
 
 
@@ -80,12 +78,12 @@ class DamBreak(Case):
     )
 
     def tables(self, n: int) -> Tables:
-        h = WIDTH / n
+        h = COLUMN / n
         across, up = 13 * n // 2, 5 * n // 2
-        column = box([0.0, 0.0], [WIDTH, N_SQUARED * WIDTH])
+        column = box([0.0, 0.0], [COLUMN, N_SQUARED * COLUMN])
         return problem(
             {"size": [across * h, up * h], "cells": [across, up], "gravity": [0.0, -GRAVITY], "walls": "separate"},
-            (LAST / math.sqrt(N_SQUARED * GRAVITY / WIDTH), 80),
+            (LAST / math.sqrt(N_SQUARED * GRAVITY / COLUMN), 80),
             "velocity",
             [body("water", fluid(DENSITY, "auto"), column, initial_pressure="hydrostatic")],
         )
@@ -95,11 +93,11 @@ class DamBreak(Case):
         for frame, _ in frames:
             x, y = frame.position.astype(np.float64).T
             # Half the edge of a particle.
-            reach = WIDTH * math.sqrt(N_SQUARED / len(x)) / 2
+            reach = COLUMN * math.sqrt(N_SQUARED / len(x)) / 2
             times.append(frame.time)
-            fronts.append((np.quantile(x, 1 - FILM) + reach) / WIDTH)
-            heights.append((y[x < BACK * WIDTH].max() + reach) / (N_SQUARED * WIDTH))
-        T = np.array(times) * math.sqrt(N_SQUARED * GRAVITY / WIDTH)
+            fronts.append((np.quantile(x, 1 - FILM) + reach) / COLUMN)
+            heights.append((y[x < BACK * COLUMN].max() + reach) / (N_SQUARED * COLUMN))
+        T = np.array(times) * math.sqrt(N_SQUARED * GRAVITY / COLUMN)
         front = np.array(fronts)
         curves = measured("front")
         errors = {f"series {series.name}": mean_error(series, T, front) for series in curves}
@@ -114,4 +112,141 @@ class DamBreak(Case):
         }
 
 
-CASES = (DamBreak(),)
+# Of the tank and of the water, m.
+LENGTH, WIDTH, HEIGHT = 3.22, 1.0, 1.0
+DAM, DEPTH = 1.992, 0.55
+# Two corners of the box, m, which stands on the floor.
+LOWER, UPPER = (0.6635, 0.2955), (0.8245, 0.6985, 0.161)
+# Later water that the walls threw back comes down.
+END = 0.8
+# Those that are compared; they stand in the middle of the width, m.
+GAUGES = ("H2", "H3", "H4")
+MIDDLE = 0.5
+# A gauge is reached by the water where it reads this much, m. A dry one reads up to 1.5 mm.
+WET = 0.01
+# Half the width of the columns in which the water of a simulation is measured, m.
+REACH = 1 / 16
+# The face of the obstacle that the front meets, m, its speed, m/s, from its times at x = 1.488 and 0.992 m, and when
+# it meets it, s.
+FACE = 0.8245
+SPEED = (1.488 - 0.992) / (0.358 - 0.194)
+IMPACT = 0.358 + (0.992 - FACE) / SPEED
+
+
+@dataclass(frozen=True)
+class Gauge:
+    """Where a height was measured, m, the first time with more than WET, s, and heights, m, at times, s, (n,) each."""
+
+    x: float
+    arrival: float
+    time: np.ndarray
+    height: np.ndarray
+
+    def mean_error(self, time: np.ndarray, height: np.ndarray, last: float) -> float:
+        """Return the mean of |height - measured| of a curve from the arrival to a last time, over the mean measured."""
+        here = (self.time > self.arrival) & (self.time <= last * (1 + 1e-9))
+        known = self.height[here]
+        return float(np.mean(np.abs(np.interp(self.time[here], time, height) - known)) / np.mean(known))
+
+
+@lru_cache
+def measured_gauges() -> dict[str, Gauge]:
+    """Return the gauges by name, H1 to H4."""
+    tables = reference_data("kleefsman")
+    time = np.array(tables["time"])
+    return {row["name"]: Gauge(row["x"], row["arrival"], time, np.array(row["height"])) for row in tables["gauge"]}
+
+
+def water_height(position: np.ndarray, x: float, volume: float, reach: float = REACH) -> float:
+    """Return how high the water of a column stands, m: its volume over its floor, so that a lone drop adds little.
+
+    The column has no edge that a particle could jump over: what it holds counts by a hat function along both axes,
+    one in the middle, at the gauge, and zero at `reach`, m. Particles have one volume, m^3.
+    """
+    off = np.abs(position[:, :2] - [x, MIDDLE]) / reach
+    return volume * float(np.prod(np.maximum(1 - off, 0.0), axis=1).sum()) / reach**2
+
+
+def impact(time: np.ndarray, front: np.ndarray) -> float:
+    """Return when the front, which comes from larger x, is at the obstacle, s."""
+    return float(np.interp(-FACE, -front, time))
+
+
+def arrival(time: np.ndarray, value: np.ndarray, level: float = WET) -> float:
+    """Return when a curve, such as the height at a gauge, rises above a level, s; nan where it never does."""
+    above = value > level
+    if not above.any():
+        return math.nan
+    k = int(np.argmax(above))
+    return float(np.interp(level, value[k - 1 : k + 1], time[k - 1 : k + 1])) if k else float(time[0])
+
+
+class DamBreakObstacle(Case):
+    """Water at rest at one end of a tank, its pressure hydrostatic, whose gate is gone at t = 0; no friction."""
+
+    text = case_text("dam_break_obstacle")
+    name, title, group = "dam_break_obstacle", "Dam break on an obstacle, SPHERIC test 2", "fluids"
+    levels = {"coarse": (16,), "default": (16, 24, 32), "fine": (16, 24, 32, 40)}  # noqa: RUF012
+    measures = (
+        text.measure("height error", 0.2),
+        text.measure("height error H2", 0.2),
+        text.measure("height error H3", lambda n: 0.25 + 2 / n),
+        text.measure("height error H4", 0.02),
+        text.measure("arrival H3 (s)", 0.06),
+        text.measure("arrival H2 (s)", 0.02),
+        text.measure("impact (s)", 0.02),
+        text.measure("first force (s)", 0.03),
+        text.measure("peak (s)", 0.12),
+        text.measure("largest force", 2.0),
+        # Rounding decides which drop gets deepest.
+        text.measure("depth in the box (h)", 0.5, rounding=0.5),
+    )
+    varies = ("precision",)
+
+    def tables(self, n: int) -> Tables:
+        h = WIDTH / n
+        along, up = math.ceil(LENGTH / h - 1e-9), math.ceil(HEIGHT / h - 1e-9)
+        column = box([DAM, 0.0, 0.0], [LENGTH, WIDTH, DEPTH])
+        return problem(
+            {
+                # What is too long lies behind the box.
+                "origin": [LENGTH - along * h, 0.0, 0.0],
+                "size": [along * h, WIDTH, up * h],
+                "cells": [along, n, up],
+                "gravity": [0.0, 0.0, -GRAVITY],
+                "walls": "separate",
+            },
+            (END, 80),
+            "velocity",
+            [body("water", fluid(DENSITY, "auto"), column, initial_pressure="hydrostatic")],
+            # It reaches below the floor, so that no node of the floor under it is free.
+            colliders=[{"name": "obstacle", "shape": box([*LOWER, -2 * h], UPPER)}],
+        )
+
+    def measure(self, n: int, scene: Scene, frames: Frames) -> dict[str, float]:
+        gauges = {name: measured_gauges()[name] for name in GAUGES}
+        times, fronts, forces, heights, deepest = [], [], [], [], 0.0
+        for frame, row in frames:
+            place = frame.position.astype(np.float64)
+            volume = (LENGTH - DAM) * WIDTH * DEPTH / len(place)
+            times.append(frame.time)
+            fronts.append(np.quantile(place[:, 0], FILM))
+            forces.append(-row.collider_force[0][0])
+            heights.append([water_height(place, gauge.x, volume) for gauge in gauges.values()])
+            deepest = max(deepest, float(np.minimum(place - [*LOWER, -math.inf], UPPER - place).min(axis=1).max()))
+        time, force = np.array(times), np.array(forces)
+        curves = dict(zip(gauges, np.array(heights).T, strict=True))
+        errors = [gauge.mean_error(time, curves[name], END) for name, gauge in gauges.items()]
+        # Forces are means since the frame before.
+        middle = time - END / (2 * (len(time) - 1))
+        face = (UPPER[1] - LOWER[1]) * UPPER[2]
+        return {
+            "height error": float(np.mean(errors)),
+            **{f"height error {name}": error for name, error in zip(gauges, errors, strict=True)},
+            **{f"arrival {name}": arrival(time, curves[name]) - gauges[name].arrival for name in ("H3", "H2")},
+            "impact": impact(time, np.array(fronts)) - IMPACT,
+            "first force": arrival(middle, force, force.max() / 10) - IMPACT,
+            "peak": float(middle[np.argmax(force)]) - IMPACT,
+            "largest force": float(force.max()) / (DENSITY * SPEED**2 / 2 * face),
+            "depth in the box": deepest * n / WIDTH,
+        }

@@ -3,25 +3,24 @@
 import numpy as np
 
 from mpmcli.scene import Scene
-from mpmcli.validation.case import Case, Frames, case_text
-from mpmcli.validation.measuring import field
-from mpmcli.validation.tables import Tables, ball, body, fluid, problem
+from mpmcli.validation.case import Case, Frames, Tables, case_text
+from mpmcli.validation.shared import ball, body, field, fluid, problem
 
 # A0 = 1/s, R = 1 m; END and c = 15 A0 R as in the literature.
 DENSITY, SOUND, END = 1000.0, 15.0, 0.76
 FRAMES = 4
 
 
-def half_axis(time: float, rate: float = 1.0) -> float:
-    """Return the half axis a(t) along x of a drop that is a disc, a(0) = 1, with v = rate (-x, y) at t = 0.
+def half_axis(time: float) -> float:
+    """Return the half axis a(t) along x of a drop that is a disc, a(0) = 1, with v = (-x, y) at t = 0.
 
     The flow v = A (-x, y) keeps an ellipse of half axes a and 1/a and the energy A^2 (a^2 + a^-2). Hence
-    da/dt = -a A with A = rate sqrt(2 / (a^2 + a^-2)), integrated to 1e-13.
+    da/dt = -a A with A = sqrt(2 / (a^2 + a^-2)), integrated to 1e-13.
     """
     from scipy.integrate import solve_ivp
 
     accuracy = {"method": "DOP853", "rtol": 1e-13, "atol": 1e-13}
-    solution = solve_ivp(lambda _, a: -a * np.sqrt(2 / (a * a + 1 / (a * a))), (0.0, rate * time), [1.0], **accuracy)
+    solution = solve_ivp(lambda _, a: -a * np.sqrt(2 / (a * a + 1 / (a * a))), (0.0, time), [1.0], **accuracy)
     return float(solution.y[0, -1])
 
 
@@ -30,7 +29,6 @@ class EllipticalDrop(Case):
 
     text = case_text("elliptical_drop")
     name, title, group = "elliptical_drop", "Elliptical drop", "fluids"
-    varies = ("precision", "kernel", "transfer", "per_axis", "safety")
     levels = {"coarse": (10, 20), "default": (10, 20, 40), "fine": (20, 40, 80)}  # noqa: RUF012
     measures = (
         # 0.03 h of it by shifts, which move particles off their paths.
@@ -67,6 +65,3 @@ class EllipticalDrop(Case):
             "axes error": float(axes[np.abs(axes).argmax()]),
             "energy loss": 1 - rows[-1].energy / rows[0].energy,
         }
-
-
-CASES = (EllipticalDrop(),)

@@ -10,9 +10,8 @@ import math
 import numpy as np
 
 from mpmcli.scene import Scene
-from mpmcli.validation.case import Case, Frames, case_text
-from mpmcli.validation.measuring import field, in_middle
-from mpmcli.validation.tables import Tables, body, elastic, fluid, free_blocks, lame_moduli, problem
+from mpmcli.validation.case import Case, Frames, Tables, case_text
+from mpmcli.validation.shared import body, elastic, field, fluid, free_blocks, in_middle, lame_moduli, problem
 
 DENSITY, YOUNG, NU = 1000.0, 1e6, 0.3
 MU, LAMBDA = lame_moduli(YOUNG, NU)
@@ -101,6 +100,3 @@ class Homogeneous(Case):
             if solid.name != "fluid":
                 errors.append(float(np.abs(deformation[middle] - F).max()))
         return {"deformation error": max(errors), **values}
-
-
-CASES = (Homogeneous(),)

@@ -1,4 +1,4 @@
-"""Manufactured solutions: a standing wave of large amplitude, made exact by a body force (docs/theory.md, 10)."""
+"""Manufactured solutions: a standing wave, and a ring sheared far and back, by a body force (docs/theory.md, 10)."""
 
 import math
 from collections.abc import Callable
@@ -7,9 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from mpmcli.scene import Scene
-from mpmcli.validation.case import Case, Frames, Levels, case_text
-from mpmcli.validation.measuring import field
-from mpmcli.validation.tables import Tables, body, box, elastic, lame_moduli, problem
+from mpmcli.validation.case import Case, Frames, Levels, Tables, case_text
+from mpmcli.validation.shared import ball, body, box, elastic, field, lame_moduli, problem
 
 # The grid has at least five cells per axis; in 1D the strip fills them.
 STRIP = 5
@@ -22,10 +21,10 @@ class StandingWave:
     """The motion, the force and the stress of a solid of one of two laws; `signs` has s_i, one per axis that moves.
 
     Along each axis i, with s_i = 1 or -1 (phases 0 and pi of Wallstedt and Guilkey 2008), in a unit square or cube of
-    rest density rho between slip walls:
+    density 1 at rest between slip walls:
         u_i = s_i A sin(k X_i) sin(w t), so that F is diagonal with F_i = 1 + s_i A k cos(k X_i) sin(w t),
-        b_i = d2u_i/dt2 - (dP_ii/dX_i) / rho, with dF_i/dX_i = -k^2 u_i.
-    At t = 0 nothing is displaced. Moduli are in Pa, the density in kg/m^3, the amplitude A in m.
+        b_i = d2u_i/dt2 - dP_ii/dX_i, with dF_i/dX_i = -k^2 u_i.
+    At t = 0 nothing is displaced. Moduli are in Pa, the amplitude A in m.
     """
 
     law: str
@@ -34,18 +33,12 @@ class StandingWave:
     half_waves: int
     young: float
     poisson: float
-    density: float = 1.0
     amplitude: float = 0.05
 
     @property
-    def moduli(self) -> tuple[float, float]:
-        """Return mu and lambda, Pa."""
-        return lame_moduli(self.young, self.poisson)
-
-    @property
     def frequency(self) -> float:
-        """Return w = pi c with c = sqrt(E / rho), rad/s."""
-        return math.pi * math.sqrt(self.young / self.density)
+        """Return w = pi c with c = sqrt(E / rho), rad/s; rho = 1."""
+        return math.pi * math.sqrt(self.young)
 
     def velocity(self) -> list[str]:
         """Return the initial velocity, m/s, as expressions of a scene, one per axis that moves."""
@@ -54,9 +47,13 @@ class StandingWave:
 
     def force(self) -> list[str]:
         """Return b, m/s^2, as expressions of a scene, one per axis that moves."""
-        mu, lam = (modulus / self.density for modulus in self.moduli)
+        mu, lam = lame_moduli(self.young, self.poisson)
         k2 = (self.half_waves * math.pi) ** 2
-        stretches = [self._stretch(i) for i in range(len(self.signs))]
+        swing = f"sin({self.frequency!r} * t)"
+        # F_i - 1 = s_i A k cos(k X_i) sin(w t), with A k as a multiple of pi.
+        slope = f"{self.amplitude * self.half_waves!r} * pi * cos({self._wave} *"
+        moving = list(zip(self.signs, AXES, strict=False))
+        stretches = [f"(1 {'+' if sign > 0 else '-'} {slope} {name}) * {swing})" for sign, name in moving]
         texts = []
         for i, F in enumerate(stretches):
             if self.law == "neo_hookean":
@@ -68,7 +65,8 @@ class StandingWave:
                 # P_ii = 2 mu (F_i - 1) + lambda (J - 1) J / F_i, where J / F_i is the product of the others.
                 others = " * ".join(f"{stretch}**2" for j, stretch in enumerate(stretches) if j != i)
                 stiffness = f"{2 * mu!r} + {lam!r} * {others}" if others else f"{2 * mu + lam!r}"
-            texts.append(f"{self._moved(i)} * ({k2!r} * ({stiffness}) - {self.frequency**2!r})")
+            moved = f"{self.signs[i] * self.amplitude!r} * sin({self._wave} * {AXES[i]}) * {swing}"
+            texts.append(f"{moved} * ({k2!r} * ({stiffness}) - {self.frequency**2!r})")
         return texts
 
     def displacement(self, X: np.ndarray, time: float) -> np.ndarray:
@@ -90,7 +88,7 @@ class StandingWave:
         """Return the diagonal of the first Piola-Kirchhoff stress, (n, 3), Pa."""
         F = self.stretches(X, time)
         J = F.prod(axis=1)[:, None]
-        mu, lam = self.moduli
+        mu, lam = lame_moduli(self.young, self.poisson)
         if self.law == "neo_hookean":
             return mu * (F - 1 / F) + lam * np.log(J) / F
         return 2 * mu * (F - 1) + lam * (J - 1) * J / F
@@ -103,19 +101,6 @@ class StandingWave:
     @property
     def _wave(self) -> str:
         return "pi" if self.half_waves == 1 else f"{self.half_waves} * pi"
-
-    @property
-    def _swing(self) -> str:
-        return f"sin({self.frequency!r} * t)"
-
-    def _moved(self, i: int) -> str:
-        return f"{self.signs[i] * self.amplitude!r} * sin({self._wave} * {AXES[i]}) * {self._swing}"
-
-    def _stretch(self, i: int) -> str:
-        sign = "+" if self.signs[i] > 0 else "-"
-        # F_i - 1 = s_i A k cos(k X_i) sin(w t), with A k as a multiple of pi.
-        slope = self.amplitude * self.half_waves
-        return f"(1 {sign} {slope!r} * pi * cos({self._wave} * {AXES[i]}) * {self._swing})"
 
 
 class ManufacturedWave(Case):
@@ -152,7 +137,7 @@ class ManufacturedWave(Case):
                 lambda n: _displacement(n, *error),
                 order=1.9,
                 expected=2.0,
-                order_to=None if total else 16,
+                order_to=math.inf if total else 16,
             ),
             self.text.measure("largest displacement error", lambda n: 3.6 * _displacement(n, *error), expected=2.0),
             self.text.measure("stress error", stress, order=1.0 if total else None, expected=2.0),
@@ -164,7 +149,7 @@ class ManufacturedWave(Case):
         size, cells, velocity, force = [1.0] * d, [n] * d, wave.velocity(), wave.force()
         if d == 1:
             size, cells, velocity, force = [1.0, STRIP / n], [n, STRIP], [*velocity, 0.0], [*force, 0.0]
-        solid = elastic(wave.law, wave.density, wave.young, wave.poisson)
+        solid = elastic(wave.law, 1.0, wave.young, wave.poisson)
         return problem(
             {"size": size, "cells": cells, "walls": "slip"},
             (2 * math.pi / wave.frequency, FRAMES),
@@ -208,6 +193,99 @@ LEVELS: Levels = {"coarse": (8, 16), "default": (8, 16, 32, 64), "fine": (8, 16,
 CUBE_LEVELS: Levels = {"coarse": (12, 16), "default": (12, 16, 32), "fine": (12, 16, 32, 48)}
 STEFFEN = "Steffen, Wallstedt, Guilkey, Kirby and Berzins 2008 (CMES 31:107)"
 WALLSTEDT = "Wallstedt and Guilkey 2008 (JCP 227:9628)"
+
+# Inner and outer radius of the ring, m; the outer one is that of the disc.
+INNER, OUTER = 0.75, 1.25
+MIDDLE, HALF = (OUTER + INNER) / 2, (OUTER - INNER) / 2
+YOUNG, POISSON, DENSITY = 1000.0, 0.3, 1000.0
+MU = YOUNG / (2 * (1 + POISSON))
+# Largest angle, rad; the largest engineering shear is 2.1.
+ANGLE = 0.3
+PERIOD = 1.0
+MARGIN = 0.25
+
+
+def turn(R: np.ndarray, time: float) -> np.ndarray:
+    """Return the angle alpha, rad, by which a circle of radius R, m, is turned at a time, s."""
+    s = (R - MIDDLE) / HALF
+    shape = np.where(np.abs(s) < 1, (1 - s**2) ** 2, 0.0)
+    return ANGLE * (1 - math.cos(2 * math.pi * time / PERIOD)) / 2 * shape
+
+
+def body_force() -> list[str]:
+    """Return the acceleration, m/s^2, as expressions of a scene.
+
+    With kappa = R dalpha/dR, P is mu (F - F^-T), as J = 1, and
+
+        a_r = mu kappa^2 / (rho R) - R (dalpha/dt)^2,
+        a_theta = R d2alpha/dt2 - mu (dkappa/dR + 2 kappa / R) / rho
+
+    along the directions that the motion has turned.
+    """
+    R, w = "hypot(X, Y)", 2 * math.pi / PERIOD
+    s = f"(({R} - {MIDDLE}) / {HALF})"
+    # The shape of alpha over R, and its derivatives with respect to R.
+    shape = f"(1 - {s}**2)**2"
+    slope = f"({-4 / HALF} * {s} * (1 - {s}**2))"
+    bend = f"({-4 / HALF**2} * (1 - 3 * {s}**2))"
+    # alpha's factor of time, and its derivatives.
+    g = f"({ANGLE / 2} * (1 - cos({w!r} * t)))"
+    rate = f"({ANGLE / 2 * w!r} * sin({w!r} * t))"
+    rise = f"({ANGLE / 2 * w**2!r} * cos({w!r} * t))"
+    kappa = f"({R} * {g} * {slope})"
+    radial = f"({MU / DENSITY!r} * {kappa}**2 / {R} - {R} * ({rate} * {shape})**2)"
+    around = f"({R} * {rise} * {shape} - {MU / DENSITY!r} * ({g} * ({slope} + {R} * {bend}) + 2 * {kappa} / {R}))"
+    alpha = f"({g} * {shape})"
+    cosine = f"((X * cos({alpha}) - Y * sin({alpha})) / {R})"
+    sine = f"((Y * cos({alpha}) + X * sin({alpha})) / {R})"
+    return [
+        f"{radial} * {cosine} - {around} * {sine} if {R} > {INNER} else 0",
+        f"{radial} * {sine} + {around} * {cosine} if {R} > {INNER} else 0",
+    ]
+
+
+class Vortex(Case):
+    """Circles between R = 0.75 and 1.25 m turn by alpha(R, t) and back; what lies inside them stays at rest."""
+
+    text = case_text("vortex")
+    name, title, group = "vortex", "Large shear and back: the generalized vortex", "solids"
+    solids = "total"
+    varies = ("precision", "transfer", "per_axis", "safety")
+    levels: Levels = {"coarse": (4, 8), "default": (4, 8, 16), "fine": (4, 8, 16)}  # noqa: RUF012
+    measures = (
+        text.measure(
+            "error at the end", lambda n: 1.3 * 0.0299 * (8 / n) ** 1.8 if n >= 8 else 0.25, order=1.7, expected=2.0
+        ),
+        text.measure("displacement error", lambda n: 0.036 * (8 / n) ** 1.8 if n >= 8 else 0.15),
+    )
+
+    def tables(self, n: int) -> Tables:
+        edge = OUTER + MARGIN
+        return problem(
+            {"origin": [-edge, -edge], "size": [2 * edge, 2 * edge], "spacing": 2 * HALF / n},
+            (PERIOD, FRAMES),
+            "initial_position",
+            [body("disc", elastic("neo_hookean", DENSITY, YOUNG, POISSON), ball([0.0, 0.0], OUTER))],
+            forces=[{"acceleration": body_force()}],
+        )
+
+    def measure(self, n: int, scene: Scene, frames: Frames) -> dict[str, float]:
+        squares = []
+        for frame, _ in frames:
+            X = field(frame, "initial_position")
+            alpha = turn(np.hypot(*X.T), frame.time)
+            place = np.stack(
+                [X[:, 0] * np.cos(alpha) - X[:, 1] * np.sin(alpha), X[:, 1] * np.cos(alpha) + X[:, 0] * np.sin(alpha)],
+                axis=1,
+            )
+            squares.append(((frame.position - place) ** 2).sum(axis=1).mean())
+        scale = ANGLE * MIDDLE
+        return {
+            "error at the end": math.sqrt(squares[-1]) / scale,
+            "displacement error": math.sqrt(np.mean(squares[1:])) / scale,
+        }
+
+
 CASES = (
     ManufacturedWave(
         "mms_1d",
@@ -247,4 +325,5 @@ CASES = (
         error=(0.015, 0.005),
         stress=lambda n: _second_order(n, 0.043, 0.045),
     ),
+    Vortex(),
 )

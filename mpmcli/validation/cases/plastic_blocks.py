@@ -12,9 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from mpmcli.scene import Scene
-from mpmcli.validation.case import Case, Frames, case_text
-from mpmcli.validation.measuring import field, in_middle
-from mpmcli.validation.tables import Tables, body, elastic, fluid, free_blocks, lame_moduli, problem
+from mpmcli.validation.case import Case, Frames, Tables, case_text
+from mpmcli.validation.shared import body, elastic, field, fluid, free_blocks, in_middle, lame_moduli, problem
 
 DENSITY, YOUNG, NU = 1000.0, 1e6, 0.1
 MU, LAMBDA = lame_moduli(YOUNG, NU)
@@ -55,35 +54,33 @@ OIL = WATER | {"bulk_viscosity": BULK_VISCOSITY, "viscosity": VISCOSITY}
 class Block:
     """One block, whose measure is the error of its Kirchhoff stress, d x d, Pa, nan where `stress` does not know it.
 
-    `motion` takes d and returns F - I at the end. The error is set over a scale, or the norm of the known stress;
-    at n = 32 it has `noise` of quadrature, which grows as n^2, and the `lag` of the step, which falls as 1/n. Where the
-    block swings, a force that is linear in the place drives it, from `motion` as rate times END.
+    At the end it is stretched by `last` along the last axis, by `everywhere` along all, and the first axis is sheared
+    along the last. The error is set over a scale, or the norm of the known stress; at n = 32 it has `noise` of
+    quadrature, which grows as n^2, and the `lag` of the step, which falls as 1/n. Where the block swings, a force that
+    is linear in the place drives it, from `motion` as rate times END.
     """
 
     name: str
     material: Tables
-    motion: Callable[[int], np.ndarray]
     stress: Callable[[np.ndarray], np.ndarray]
+    last: float = 0.0
+    everywhere: float = 0.0
+    shear: float = 0.0
     scale: float | None = None
     noise: float = 0.0
     lag: float = 0.0
     swings: bool = False
 
+    def motion(self, d: int) -> np.ndarray:
+        """Return F - I at the end."""
+        L = self.everywhere * np.eye(d)
+        L[-1, -1] += self.last
+        L[0, -1] += self.shear
+        return L
+
     def bound(self, n: int) -> float:
         """Return the largest admissible error."""
         return max(1.5 * (self.noise * (n / 32) ** 2 + self.lag * 32 / n), LEAST)
-
-
-def strained(last: float = 0.0, everywhere: float = 0.0, shear: float = 0.0) -> Callable[[int], np.ndarray]:
-    """Return a stretch along the last axis or all axes, with a shear of the first axis along the last."""
-
-    def motion(d: int) -> np.ndarray:
-        L = everywhere * np.eye(d)
-        L[-1, -1] += last
-        L[0, -1] += shear
-        return L
-
-    return motion
 
 
 def hardened(F: np.ndarray) -> np.ndarray:
@@ -153,17 +150,17 @@ def compressed(F: np.ndarray) -> np.ndarray:
 
 
 BLOCKS = (
-    Block("hardening", METAL, strained(-0.03), hardened, noise=2.9e-4),
-    Block("cohesion", DAMP, strained(-0.01), pressed, noise=1.4e-5),
-    Block("tension", DAMP, strained(everywhere=0.01), at_the_tip),
-    Block("reopened", DRY, strained(everywhere=SWING * END * OPENING), reopened, swings=True),
-    Block("packed snow", SNOW, strained(-0.05), snow, noise=8.2e-4),
-    Block("torn snow", SNOW, strained(0.02), snow, noise=1.5e-5),
-    Block("paste that flows", PASTE, strained(shear=0.1), flowing, lag=1.3e-4),
-    Block("paste at rest", PASTE, strained(-0.001, shear=0.6 * PASTE_YIELD / MU), resting),
-    Block("viscous fluid", OIL, strained(-0.005), squeezed, lag=5.3e-5),
-    Block("soft fluid", SOFT_WATER, strained(-0.05), compressed, noise=4.5e-5),
-    Block("opened fluid", WATER, strained(everywhere=0.01), np.zeros_like, scale=BULK / 100),
+    Block("hardening", METAL, hardened, last=-0.03, noise=2.9e-4),
+    Block("cohesion", DAMP, pressed, last=-0.01, noise=1.4e-5),
+    Block("tension", DAMP, at_the_tip, everywhere=0.01),
+    Block("reopened", DRY, reopened, everywhere=SWING * END * OPENING, swings=True),
+    Block("packed snow", SNOW, snow, last=-0.05, noise=8.2e-4),
+    Block("torn snow", SNOW, snow, last=0.02, noise=1.5e-5),
+    Block("paste that flows", PASTE, flowing, shear=0.1, lag=1.3e-4),
+    Block("paste at rest", PASTE, resting, last=-0.001, shear=0.6 * PASTE_YIELD / MU),
+    Block("viscous fluid", OIL, squeezed, last=-0.005, lag=5.3e-5),
+    Block("soft fluid", SOFT_WATER, compressed, last=-0.05, noise=4.5e-5),
+    Block("opened fluid", WATER, np.zeros_like, everywhere=0.01, scale=BULK / 100),
 )
 
 

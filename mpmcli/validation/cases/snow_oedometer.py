@@ -3,9 +3,8 @@
 import numpy as np
 
 from mpmcli.scene import Scene
-from mpmcli.validation.case import Case, Frames, case_text
-from mpmcli.validation.measuring import field
-from mpmcli.validation.tables import Tables, body, elastic, lame_moduli, problem, shaft
+from mpmcli.validation.case import Case, Frames, Tables, case_text
+from mpmcli.validation.shared import body, elastic, field, lame_moduli, problem, shaft
 
 DENSITY, DEPTH = 400.0, 1.0
 YOUNG, NU, COMPRESSION, HARDENING = 1.4e5, 0.2, 0.025, 10.0
@@ -64,15 +63,12 @@ class SnowOedometer(Case):
         }
 
 
-def confined_height(Y: float, points: int = 2000) -> float:
+def confined_height(Y: float) -> float:
     """Return the height of the snow that began at Y, m, under the weight of what is above.
 
     The stretch at each height is where the closed form, which grows with compression, reaches the weight.
     """
     stretch = np.linspace(1.0, 0.7, 20001)
-    heights = (np.arange(points) + 0.5) * Y / points
+    heights = (np.arange(2000) + 0.5) * Y / 2000
     found = np.interp(DENSITY * PULL * (DEPTH - heights), -confined_stress(stretch), stretch)
     return float(found.mean() * Y)
-
-
-CASES = (SnowOedometer(),)

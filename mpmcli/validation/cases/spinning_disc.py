@@ -5,9 +5,8 @@ import math
 import numpy as np
 
 from mpmcli.scene import Scene
-from mpmcli.validation.case import Case, Frames, case_text
-from mpmcli.validation.measuring import field
-from mpmcli.validation.tables import Tables, ball, body, elastic, problem
+from mpmcli.validation.case import Case, Frames, Tables, case_text
+from mpmcli.validation.shared import ball, body, elastic, field, problem
 
 RADIUS, YOUNG, POISSON, DENSITY, SPIN = 0.5, 1e6, 0.3, 1000.0, 5.0
 TURNS, FRAMES_PER_TURN = 10, 8
@@ -62,6 +61,3 @@ class SpinningDisc(Case):
             "angle error": turned / (SPIN * frame.time) - 1,
             "angular momentum": momentum[-1] / momentum[0] - 1,
         }
-
-
-CASES = (SpinningDisc(),)

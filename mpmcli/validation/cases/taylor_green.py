@@ -6,9 +6,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from mpmcli.scene import Scene
-from mpmcli.validation.case import Case, Frames, case_text
-from mpmcli.validation.measuring import damped_step
-from mpmcli.validation.tables import Tables, body, box, fluid, problem
+from mpmcli.validation.case import Case, Frames, Tables, case_text
+from mpmcli.validation.shared import body, box, damped_step, fluid, problem
 
 # L = 1 m, U = 1 m/s, density 1 kg/m^3.
 VISCOSITY, SOUND, PRESSURE, END, FRAMES = 0.01, 20.0, 1.0, 1.0, 20
@@ -101,6 +100,3 @@ class TaylorGreen(Case):
             "decay unexplained": float(rate / (DECAY + predicted) - 1),
             "velocity error": float(np.abs(v - exact).mean() / np.abs(exact).mean()),
         }
-
-
-CASES = (TaylorGreen(),)

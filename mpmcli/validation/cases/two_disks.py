@@ -5,9 +5,8 @@ import math
 import numpy as np
 
 from mpmcli.scene import Scene
-from mpmcli.validation.case import Case, Frames, Measure, case_text
-from mpmcli.validation.measuring import field
-from mpmcli.validation.tables import Tables, ball, body, elastic, problem
+from mpmcli.validation.case import Case, Frames, Measure, Tables, case_text
+from mpmcli.validation.shared import ball, body, elastic, field, problem
 
 RADIUS, CENTRE, SPEED = 0.2, 0.3, 0.1
 DENSITY, YOUNG, POISSON = 1000.0, 1000.0, 0.3
@@ -116,6 +115,3 @@ class SeparateDisks(TwoDisks):
 
     def tables(self, n: int) -> Tables:
         return super().tables(n) | {"contact": {"default": "separate"}}
-
-
-CASES = (TwoDisks(), TotalDisks(), SeparateDisks())

@@ -18,7 +18,6 @@ from mpmcli.scene.surface import collider_surface, form_surface, surface_points
 
 # Of colliders, or of the domain as well.
 Walls = Literal["none", "colliders", "all"]
-WALLS: tuple[Walls, ...] = ("none", "colliders", "all")
 # What a particle on a wall is part of: what rests, what moves as the scene says, or what moves freely.
 KINDS = ("wall", "moving_wall", "rigid_body")
 # The number in place of that of a collider, of the walls of the domain.
@@ -102,7 +101,7 @@ class WallParticles:
         return found
 
 
-class ThinnedTrajectory:
+class SubsampledTrajectory:
     """Every `stride`-th frame, and at most `most` particles, of a `source`; those on `walls` do not count.
 
     They are the same in all frames and exports: of each body its share at random. The ledger is of all particles.

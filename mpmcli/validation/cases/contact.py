@@ -1,14 +1,60 @@
-"""Bodies with velocity fields of their own on slopes: one slides on another with friction, a disk rolls on a plane."""
+"""Blocks on walls and on each other: one that takes off, and those that slide or roll by Coulomb's law."""
 
 import math
 
 import numpy as np
 
 from mpmcli.scene import Scene
-from mpmcli.validation.case import Case, Frames, case_text
-from mpmcli.validation.tables import Tables, ball, body, box, elastic, problem, smooth_ramp
+from mpmcli.validation.case import Case, Frames, Measure, Tables, case_text
+from mpmcli.validation.shared import ball, body, box, elastic, problem, smooth_ramp
 
-GRAVITY, DENSITY, YOUNG, POISSON = 9.81, 1000.0, 4e6, 0.3
+GRAVITY, DENSITY, YOUNG = 9.81, 1000.0, 1e6
+# The block that slides along a floor, m, its friction, and its speed, m/s.
+LENGTH, HEIGHT, FRICTION, SPEED = 1.0, 0.25, 0.3, 2.0
+DECELERATION = FRICTION * GRAVITY
+STOP = SPEED / DECELERATION
+
+
+class SlidingBlock(Case):
+    """v = v0 - mu g t along the floor, and rest after v0^2 / (2 mu g)."""
+
+    text = case_text("sliding_block")
+    name, title, group = "sliding_block", "Block that slides along a rough floor and stops", "solids"
+    levels = {"coarse": (4,), "default": (4, 8), "fine": (4, 8, 16)}  # noqa: RUF012
+    varies = ("precision", "kernel", "transfer")
+    measures = (
+        Measure("distance error: How far it slides, relative to v0^2 / (2 mu g).", 7e-3),
+        Measure("deceleration error: While it slides, relative to mu g.", 7e-3),
+        Measure("drift (L/s): Speed of what has come to rest, in lengths per second.", 8e-5),
+    )
+
+    def tables(self, n: int) -> Tables:
+        block = body(
+            "block",
+            # With nu = 0 the weight makes one-dimensional compression, in which the block begins.
+            elastic("neo_hookean", DENSITY, YOUNG, 0.0),
+            box([2 * HEIGHT, 0.0], [2 * HEIGHT + LENGTH, HEIGHT]),
+            velocity=[SPEED, 0.0],
+            deformation=[[1.0, 0.0], [0.0, f"1 - {DENSITY * GRAVITY / YOUNG} * ({HEIGHT} - Y)"]],
+        )
+        domain = {"size": [16 * HEIGHT, 2 * HEIGHT], "spacing": HEIGHT / n, "gravity": [0.0, -GRAVITY]}
+        walls = {"walls": "separate", "friction": {"y_min": FRICTION}}
+        return problem(domain | walls, (2.5 * STOP, 250), "velocity", [block])
+
+    def measure(self, n: int, scene: Scene, frames: Frames) -> dict[str, float]:
+        path = np.array([(frame.time, frame.position[:, 0].mean(dtype=np.float64)) for frame, _ in frames]).T
+        time, place = path
+        sliding, resting = (time > 0.1 * STOP) & (time < 0.9 * STOP), time > 1.1 * STOP
+        slowing = -2 * np.polyfit(time[sliding], place[sliding], 2)[0]
+        return {
+            "distance error": abs(float(place[resting].mean() - place[0]) / (SPEED**2 / (2 * DECELERATION)) - 1),
+            "deceleration error": abs(float(slowing) / DECELERATION - 1),
+            "drift": abs(float(np.polyfit(time[resting], place[resting], 1)[0])) / LENGTH,
+        }
+
+
+# Of the bodies with velocity fields of their own.
+SOLID = elastic("neo_hookean", DENSITY, 4e6, 0.3)
 # The weight comes on, then what pulls along the slope, then rates are measured, s.
 LOADED, MEASURED, END = 0.2, 0.25, 0.6
 FRAMES = 60
@@ -38,12 +84,12 @@ class SlopeContact(Case):
     degrees, friction, height = 30.0, 0.3, 0.25
 
     def tables(self, n: int) -> Tables:
-        h, material = self.height / n, elastic("neo_hookean", DENSITY, YOUNG, POISSON)
+        h = self.height / n
         off, edge = 0.3 * h, self.height
         top = edge + off
         bodies = [
-            body("base", material, box([edge + off, 0.0], [9 * edge + off, top])),
-            body("block", material, box([2 * edge + off, top], [4 * edge + off, top + edge])),
+            body("base", SOLID, box([edge + off, 0.0], [9 * edge + off, top])),
+            body("block", SOLID, box([2 * edge + off, top], [4 * edge + off, top + edge])),
         ]
         domain = {"size": [10 * edge, 3 * edge], "spacing": h, "walls": {"default": "separate", "y_min": "stick"}}
         gravity = pull(self.degrees, np.array([1.0, 0.0]), np.array([0.0, 1.0]))
@@ -84,9 +130,7 @@ class RollingContact(SlopeContact):
     def tables(self, n: int) -> Tables:
         along, up = self.axes()
         start = np.array([0.3, 0.5])
-        disk = body(
-            "disk", elastic("neo_hookean", DENSITY, YOUNG, POISSON), ball(start + self.radius * up, self.radius)
-        )
+        disk = body("disk", SOLID, ball(start + self.radius * up, self.radius))
         plane = {"plane": {"point": start.tolist(), "normal": up.tolist()}}
         domain = {"size": [1.0, 1.0], "spacing": self.radius / n, "gravity": pull(self.degrees, along, up)}
         more = {
@@ -109,4 +153,35 @@ class RollingContact(SlopeContact):
         }
 
 
-CASES = (SlopeContact(), RollingContact())
+# The block that takes off: its edge, m, and velocity, m/s.
+EDGE, VELOCITY = 1.0, (1.5, 4.0)
+
+
+class TakeOff(Case):
+    """x = X + v t - g t^2/2 from the first step on: walls that let go do not pull."""
+
+    text = case_text("take_off")
+    name, title, group = "take_off", "Block that takes off from separating walls", "invariants"
+    levels = {"coarse": (8,), "default": (8, 16), "fine": (8, 16, 32)}  # noqa: RUF012
+    varies = ("precision", "transfer")
+    measures = (
+        Measure("path error: Largest distance of a particle from its parabola, over the edge.", 1e-12),
+        Measure("stress (E): Largest stress in the block.", 1e-12),
+    )
+
+    def tables(self, n: int) -> Tables:
+        material = elastic("neo_hookean", DENSITY, YOUNG, 0.3)
+        block = body("block", material, box([0.0, 0.0], [EDGE, EDGE]), velocity=[*VELOCITY])
+        domain = {"size": [3 * EDGE] * 2, "cells": [3 * n] * 2, "gravity": [0.0, -GRAVITY], "walls": "separate"}
+        # It does not come down again until then.
+        return problem(domain, (0.5, 10), "stress initial_position", [block])
+
+    def measure(self, n: int, scene: Scene, frames: Frames) -> dict[str, float]:
+        path = stress = 0.0
+        for frame, _ in frames:
+            t = frame.time
+            flown = np.array(VELOCITY) * t - np.array([0.0, GRAVITY]) * t**2 / 2
+            off = frame.position.astype(np.float64) - frame.fields["initial_position"] - flown
+            path = max(path, float(np.linalg.norm(off, axis=1).max()))
+            stress = max(stress, float(np.abs(frame.fields["stress"]).max()))
+        return {"path error": path / EDGE, "stress": stress / YOUNG}

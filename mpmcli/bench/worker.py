@@ -1,4 +1,4 @@
-"""A contestant of a benchmark: a simulation in a process of its own, that steps when it is asked to."""
+"""A worker of a benchmark: a simulation in a process of its own, that steps when it is asked to."""
 
 import multiprocessing
 import os
@@ -7,12 +7,13 @@ import tempfile
 import time
 from collections.abc import Callable
 from multiprocessing.connection import Connection
-from typing import Any, Protocol, Self
+from operator import methodcaller
+from typing import Any, Protocol
 
 from mpmcli.errors import MpmcliError, RunError
 
 
-class Contestant(Protocol):
+class Worker(Protocol):
     """A simulation that can be measured."""
 
     particles: int
@@ -28,21 +29,21 @@ class Contestant(Protocol):
         """Whether every particle is in the domain, and every step was that of the case."""
 
 
-def run_block(contestant: Contestant, seconds: float) -> tuple[int, float, float]:
+def run_block(worker: Worker, seconds: float) -> tuple[int, float, float]:
     """Step once, and on for about `seconds`; return (steps, seconds taken, of processor time), device included."""
     steps, chunk, elapsed = 0, 1, 0.0
     begin, busy = time.perf_counter(), time.process_time()
     while steps == 0 or elapsed < seconds:
-        steps += contestant.advance(chunk)
-        contestant.sync()
+        steps += worker.advance(chunk)
+        worker.sync()
         elapsed = time.perf_counter() - begin
         # Few waits for the device, and no overshoot: grow until what is left limits the next chunk.
         chunk = max(1, min(2 * chunk, int(steps / elapsed * (seconds - elapsed)) + 1))
     return steps, elapsed, time.process_time() - busy
 
 
-def serve(pipe: Connection, log: str, make: Callable[[], Contestant]) -> None:
-    """Make a contestant and apply what is asked of it, until that is None; an error is the answer, and the end."""
+def serve(pipe: Connection, log: str, make: Callable[[], Worker]) -> None:
+    """Make a worker and apply what is asked of it, until that is None; an error is the answer, and the end."""
     # What Taichi prints, and the last words of a crash; settings of Taichi from outside would reach only one side.
     output = os.open(log, os.O_WRONLY)
     os.dup2(output, 1)
@@ -50,24 +51,22 @@ def serve(pipe: Connection, log: str, make: Callable[[], Contestant]) -> None:
     for name in [name for name in os.environ if name.startswith("TI_")]:
         del os.environ[name]
     try:
-        contestant = make()
-        pipe.send((contestant.particles, contestant.threads))
+        worker = make()
+        pipe.send((worker.particles, worker.threads))
         while (asked := pipe.recv()) is not None:
             act, *arguments = asked
-            pipe.send(act(contestant, *arguments))
+            pipe.send(act(worker, *arguments))
     except MpmcliError as error:
         pipe.send(error)
 
 
 class Side:
-    """The process of a contestant, and what its blocks have cost."""
+    """The process of a worker, and what its blocks have cost."""
 
-    def __init__(self, name: str, make: Callable[[], Contestant], *, by_processor: bool) -> None:
-        """Start, and compile the kernels by a first step; RunError: it cannot.
+    def __init__(self, name: str, make: Callable[[], Worker], *, by_processor: bool) -> None:
+        """Start what `make` makes in its process, and compile the kernels by a first step; RunError: it cannot.
 
-        Args:
-            make: makes the contestant, in its process.
-            by_processor: whether costs are processor time, which excludes other processes, or wall time.
+        Costs are processor time, which excludes other processes, or wall time.
         """
         self.name, self._by_processor = name, by_processor
         self.blocks: list[float] = []
@@ -87,7 +86,7 @@ class Side:
             raise
 
     def ask(self, act: Callable[..., Any], *arguments: object) -> Any:
-        """Return act(contestant, *arguments), as its process computes it; RunError: it has failed."""
+        """Return act(worker, *arguments), as its process computes it; RunError: it has failed."""
         self._pipe.send((act, *arguments))
         return self._answer()
 
@@ -110,7 +109,7 @@ class Side:
             "ns_per_particle_step_blocks": self.blocks,
             "start_s": self.start_seconds,
             "compile_s": self.compile_seconds,
-            "sound": self.ask(is_sound),
+            "sound": self.ask(methodcaller("is_sound")),
         }
 
     def close(self) -> None:
@@ -130,14 +129,3 @@ class Side:
         if isinstance(answer, MpmcliError):
             raise RunError(f"{self.name} cannot be measured: {answer}")
         return answer
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-
-def is_sound(contestant: Contestant) -> bool:
-    """Ask a contestant whether it is sound."""
-    return contestant.is_sound()

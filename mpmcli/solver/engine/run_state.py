@@ -1,0 +1,282 @@
+"""The numbers of a run that its host and its kernels share: each has a name, a type, and one of the two that writes it.
+
+They lie in arrays with a row for each run of a batch: `numbers`, float64, and `counts`, int32, in memory that both see;
+and `step`, of the step under way, in the precision of particles and on the device alone. A number is added by a line of
+RUN or STEP: kernels and host then read and write it as `run.name`, and it is saved and loaded.
+"""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+from taichi.lang.impl import inside_kernel, subscript
+
+from mpmcli.quick_taichi import ti
+from mpmcli.solver.particles.state_bounds import ENTRIES
+
+Columns = int | range | tuple[range, ...]
+# Status of a run: free, or waiting for the host; to be measured; advancing; measured, as a bound on its step requires,
+# at its target, or with no room for frames left; with lost particles; with a stable step that collapsed; before a kick
+# that ends beyond its time tables; before a sort after which particles reach more blocks of nodes than fit.
+IDLE, MEASURE, GOING, ATTEND, LOST, COLLAPSED, BEYOND, CROWDED = range(8)
+# Bounds on the step by their code; of equal ones the lower code counts, as in a comparison of `Limit`s.
+LIMITS = ("", "collider", "deformation", "force", "forced", "maximum", "speed", "viscosity", "wave")
+# What a frame takes of the numbers of its run, as float64, before the sums of each group.
+FRAME_NUMBERS = (
+    *("time", "step_count", "last_step", "smallest", "smallest_courant", "largest", "largest_courant", "limit"),
+    "blocked",
+)
+# Most frames that a launch records of a run.
+MOST_FRAMES = 128
+
+
+class Entry(NamedTuple):
+    """A number of a run, or several under one name.
+
+    Attributes:
+        type: float or int.
+        writer: "scene", once for each scene; "host", between launches; "kernel".
+        start: at time 0; None: what writes it sets it before.
+        per: what there is one of for each: "axis", "group", "emitter"; "body" of each group, and "maximum" of each
+            group, see `state_bounds`: those have the first of them for each group. "": there is one.
+    """
+
+    type: type
+    writer: str
+    start: float | None = 0.0
+    per: str = ""
+
+
+def _real(writer: str, start: float | None = 0.0, per: str = "") -> Entry:
+    return Entry(float, writer, start, per)
+
+
+def _int(writer: str, start: float | None = 0, per: str = "") -> Entry:
+    return Entry(int, writer, start, per)
+
+
+RUN: Mapping[str, Entry] = {
+    # The scene.
+    "spacing": _real("scene"),  # of the grid, m
+    "inverse_spacing": _real("scene"),  # 1/m
+    "gradient_scale": _real("scene"),  # see `Grid`, 1/m
+    "extent": _real("scene", per="axis"),  # of the domain, m
+    "cells": _int("scene", per="axis"),
+    "gravity": _real("scene", per="axis"),  # at time 0, m/s^2
+    "wall_speed": _real("scene"),  # of the fastest wall, m/s
+    "slowest": _real("scene"),  # least speed that counts: that of the fastest emitter, m/s
+    "end": _real("scene"),  # time, s
+    "frames": _int("scene"),  # number of output times behind time 0
+    "safety": _real("scene"),  # time.safety
+    "maximum": _real("scene", math.inf),  # time.step, s
+    "forced": _int("scene"),  # whether the maximum is taken above the stable step, too
+    "collider": _real("scene", math.inf),  # bound on the step by colliders, s
+    "capacity": _int("scene", None, "group"),  # particles, those that wait included
+    "sensitivity": _real("scene", per="group"),  # of stiffness to strain, see `Law`
+    "hardening": _real("scene", per="group"),
+    "period": _real("scene", per="emitter"),  # between two sheets, s
+    "until": _real("scene", per="emitter"),  # when the last one enters, s
+    "sheets": _int("scene", per="emitter"),  # number of them
+    # How far the run has come.
+    "time": _real("kernel"),  # s
+    "step_count": _real("kernel"),
+    "last_step": _real("kernel"),  # s
+    "kick_carry": _real("kernel"),  # time by which velocities lag behind the middle of the last step, s
+    "speed": _real("kernel"),  # bound on that of every particle, m/s
+    "courant": _real("kernel"),  # cells that the fastest node moved in the last step
+    "drift": _real("kernel", math.inf),  # cells that a particle may have moved since the last sort
+    "unrelaxed": _real("kernel"),  # time since volumes were relaxed, s
+    "unrelaxed_steps": _int("kernel"),
+    "rate": _real("kernel", per="group"),  # largest rate of deformation in the last step, 1/s
+    "particles": _int("kernel", None, "group"),  # those that take part
+    "blocked": _int("kernel"),  # particles of emitters that found no room
+    "due": _real("kernel", math.inf),  # when the next sheet of any emitter enters, s
+    "due_of": _real("kernel", per="emitter"),
+    "entered": _int("kernel", per="emitter"),  # number of sheets
+    "waits": _int("kernel", per="emitter"),  # whether the next one does, for lack of room
+    # Bounds on the next step.
+    "stiffness": _real("host", math.inf),  # by the laws as last measured, s
+    "stiffness_limit": _int("host"),  # its code in LIMITS
+    "pull": _real("host"),  # bound on the acceleration by forces and steady gravity, m/s^2
+    "force": _real("host", math.inf),  # bound by the slope of forces, s
+    "first_stable_step": _real("host"),  # at time 0, s
+    "own": _real("host", None, "body"),  # bound by the stiffness of each body, s
+    "horizon": _real("host", -math.inf),  # time up to which time tables are filled, s
+    "held": _real("kernel", math.inf),  # the bound that rises late, see `StepSize.limit_rise`, s
+    "low": _real("kernel", math.inf),  # the least of this series of steps, s
+    "low_before": _real("kernel", math.inf),  # and of the one before
+    "held_steps": _real("kernel"),  # steps of this series
+    # When to measure the state again.
+    "longest": _int("host"),  # most steps between two measurements
+    "growth_allowed": _real("host"),  # of the logarithm of a stiffness
+    "unwatched": _int("kernel", per="group"),  # steps since the last measurement
+    "change": _real("kernel", per="group"),  # growth of that logarithm since, by deformation
+    "hardened": _real("kernel", per="group"),  # and by hardening
+    # What the host asks for.
+    "status": _int("host"),
+    "target": _real("host"),  # time to reach, s
+    "given": _real("host"),  # a step, s, 0 where the kernel chooses it
+    "budget": _int("host"),  # steps that may be taken in this launch
+    "arrived": _int("kernel"),  # whether the target is reached
+    # The step under way.
+    "dt": _real("kernel"),  # s
+    "kick": _real("kernel"),  # s
+    "stable": _real("kernel"),  # the largest stable step, s
+    "relaxed": _real("kernel"),  # time over which volumes relax, s, 0 in most steps
+    "steps_to_target": _real("kernel"),  # equal ones, from the start of this one
+    "deformation": _real("kernel"),  # bound by deformation, s
+    "step_limit": _int("kernel"),  # code of the bound that sets it
+    # The steps since the last frame, for the ledger.
+    "smallest": _real("kernel", math.inf),  # s
+    "smallest_courant": _real("kernel"),  # of the smallest step
+    "limit": _int("kernel"),  # code of its bound
+    "largest": _real("kernel"),  # s
+    "largest_courant": _real("kernel"),
+    # Frames that the kernel records.
+    "records": _int("host"),  # whether it does
+    "frame": _int("kernel"),  # number of the next one
+    "frame_recorded": _int("kernel"),  # whether it was recorded and no step taken since
+    "recorded": _int("kernel"),  # number of those of this launch
+    "frame_capacity": _int("host"),  # most frames of this launch
+    "row": _int("kernel"),  # of the frame buffer, the next one to be filled
+    "affine": _int("host"),  # columns there
+    "gradient": _int("host"),
+    "tau": _int("host"),
+    "activity": _int("host"),
+    # The last measurement; behind all others.
+    "maxima": _real("kernel", None, "maximum"),
+}
+STEP: Mapping[str, Entry] = {
+    "spacing": _real("host"),  # of the grid, m
+    "inverse_spacing": _real("host"),
+    "gradient_scale": _real("host"),
+    "extent": _real("host", per="axis"),  # of the domain, m
+    "dt": _real("kernel"),  # s
+    "kick": _real("kernel"),  # s
+    "stable": _real("kernel"),  # the largest stable step, s
+    "relaxed": _real("kernel"),  # time over which volumes relax, s, 0 in most steps
+    "gravity": _real("kernel", per="axis"),  # change of velocity by it, m/s
+    "speed_squared": _real("kernel"),  # of the fastest node, m^2/s^2
+    "rate": _real("kernel", per="group"),  # largest rate of deformation, 1/s
+    "volume_change": _real("kernel", per="group"),  # of the logarithm of a volume by relaxation
+}
+
+
+class Layout:
+    """The columns of the arrays for runs in d dimensions with some laws.
+
+    Attributes:
+        bodies: of each law.
+        numbers, counts, step: the columns of each array by name: one; a range, one for each axis, group or emitter; or
+            a range for each group.
+        widths: number of columns of each array, by its name.
+    """
+
+    def __init__(self, dimension: int, internal: Sequence[int], emitters: int = 0, bodies: Sequence[int] = ()) -> None:
+        """Assign columns; `internal` are the numbers of internal variables of the laws, `bodies` of bodies."""
+        self.bodies = tuple(bodies)
+        several = {"axis": dimension, "group": len(internal), "emitter": emitters}
+        of_groups = {"body": self.bodies, "maximum": [ENTRIES + 2 * n for n in internal]}
+        self.widths: dict[str, int] = {}
+
+        def columns(array: str, entries: Mapping[str, Entry]) -> dict[str, Columns]:
+            found: dict[str, Columns] = {}
+            end = 0
+            for name, entry in entries.items():
+                ranges = []
+                for size in of_groups.get(entry.per, [several.get(entry.per, 1)]):
+                    ranges.append(range(end, end + size))
+                    end += size
+                found[name] = tuple(ranges) if entry.per in of_groups else ranges[0] if entry.per else ranges[0].start
+            self.widths[array] = end
+            return found
+
+        self.numbers = columns("numbers", {name: entry for name, entry in RUN.items() if entry.type is float})
+        self.counts = columns("counts", {name: entry for name, entry in RUN.items() if entry.type is int})
+        self.step = columns("step", STEP)
+
+    def of_scene(self, array: str) -> list[int]:
+        """Return the columns of "numbers" or "counts" that the scene writes."""
+        found = [columns for name, columns in getattr(self, array).items() if RUN[name].writer == "scene"]
+        return [k for columns in found for k in ([columns] if isinstance(columns, int) else columns)]
+
+
+def _entry(array: object, w: object, column: object) -> object:
+    """Return a number: an expression in a kernel, else a number of Python, or an array for several runs."""
+    if inside_kernel():
+        return subscript(None, array, w, column)
+    found = array[w, column]
+    return found if found.ndim else found.item()
+
+
+class Several:
+    """Numbers of a run under one name, by their number among them."""
+
+    def __init__(self, array: object, w: object, columns: range | tuple[range, ...]) -> None:
+        self._array, self._w, self._columns = array, w, columns
+
+    def __getitem__(self, k: object) -> object:
+        if isinstance(self._columns, tuple):
+            return Several(self._array, self._w, self._columns[k])
+        return _entry(self._array, self._w, self._columns.start + k)
+
+    def __setitem__(self, k: int, values: object) -> None:
+        columns = self._columns[k]
+        self._array[self._w, columns if isinstance(columns, int) else slice(columns.start, columns.stop)] = values
+
+    def __len__(self) -> int:
+        return len(self._columns)
+
+    def __iter__(self) -> Iterator[object]:
+        return (self[k] for k in range(len(self)))
+
+
+class _Named:
+    """Numbers of run `w` by their names in tables of columns, each of an array."""
+
+    def __init__(self, w: object, *tables: tuple[Mapping[str, Columns], object]) -> None:
+        self.__dict__.update(w=w, _tables=tables)
+
+    def __getattr__(self, name: str) -> object:
+        for columns, array in self.__dict__["_tables"]:
+            if name in columns:
+                if not isinstance(columns[name], int):
+                    return Several(array, self.w, columns[name])
+                return _entry(array, self.w, columns[name])
+        raise AttributeError(name)
+
+    def __setattr__(self, name: str, values: object) -> None:
+        for columns, array in self._tables:
+            if name in columns:
+                found = columns[name]
+                array[self.w, slice(found.start, found.stop) if isinstance(found, range) else found] = values
+                return
+        raise AttributeError(name)
+
+
+class RunState(_Named):
+    """The numbers of run `w` of a batch, see RUN: a row of arrays on the host; or in a kernel, `w` being a variable.
+
+    On the host `w` may be `slice(None)`: each number is then an array with an entry for each run.
+    """
+
+    def __init__(self, layout: Layout, numbers: object, counts: object, w: object) -> None:
+        super().__init__(w, (layout.numbers, numbers), (layout.counts, counts))
+
+    @property
+    def velocity_time(self) -> object:
+        """Time to which velocities have advanced, s: the middle of the last step, less what they lag behind it."""
+        return self.time - 0.5 * self.last_step - self.kick_carry
+
+    def reset(self) -> None:
+        """Begin a run on the host: set what has a value at time 0."""
+        for name, entry in RUN.items():
+            if entry.start is not None:
+                setattr(self, name, entry.start)
+
+
+class StepState(_Named):
+    """The numbers of the step under way of run `w` in a kernel, see STEP; `w` being a variable."""
+
+    def __init__(self, layout: Layout, field: ti.Field, w: object) -> None:
+        super().__init__(w, (layout.step, field))
