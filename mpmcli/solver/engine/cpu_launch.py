@@ -55,7 +55,7 @@ class CpuLaunch:
         self.phases = CpuPhases(device, layout)
         self.team = CpuThreads(self.phases, device.runs)
         self.emission = CpuEmission(device, device.stencils)
-        self.alone, self.collides = device.threads == 1, device.colliders is not None
+        self.alone = device.threads == 1
         self.sum_count = sum_entries(self.dimension)
         self.next_run = ti.field(int, shape=())
         # Numbers that make this kernel another one for Taichi; see `kernel_store`.

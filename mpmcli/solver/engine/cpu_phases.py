@@ -21,7 +21,6 @@ from mpmcli.solver.frames.reader import show_range
 from mpmcli.solver.grid.grid import clear_blocks, clear_rows
 from mpmcli.solver.grid.sparse_grid import BLOCKS, PENCILS
 from mpmcli.solver.particles.sort import count_tiles, keep_all, place_particles, scratch_offset, share_start, take_all
-from mpmcli.solver.particles.state_bounds import NOTHING
 from mpmcli.solver.transfer.cpu_transfers import (
     advance_range,
     advance_tiles,
@@ -217,8 +216,7 @@ class CpuPhases(RunPhases):
         self.regions = device.threads if self.shared else 1
         self.places = CpuRegions(device, self.regions)
         self.colours = device.orders[0].colours
-        self.moves, self.separates = device.motion is not None, device.contact is not None
-        self.rigid = device.rigid is not None
+        self.separates = device.contact is not None
         # What has come in since the sort follows all colours, on one thread.
         self.passes = self.colours + device.comes_and_goes
         self.kinds: tuple[PartKind, ...] = ()
@@ -278,31 +276,6 @@ class CpuPhases(RunPhases):
         step.gradient_scale = ti.cast(run.gradient_scale, float)
         for a in ti.static(range(self.dimension)):
             step.extent[a] = ti.cast(run.extent[a], float)
-
-    @ti.func
-    def begin_step(self, run: ti.template()):
-        """Store the numbers of a step."""
-        (step,) = ti.static((self.step_of(run.w),))
-        step.dt = ti.cast(run.dt, float)
-        step.kick = ti.cast(run.kick, float)
-        step.relaxed = ti.cast(run.relaxed, float)
-        step.speed_squared = 0.0
-        if ti.static(self.device.values.gravity_varies):
-            pulled = self.device.gravity.in_step(step.kick, run.w)
-            for a in ti.static(range(self.dimension)):
-                step.gravity[a] = pulled[a]
-        else:
-            for a in ti.static(range(self.dimension)):
-                step.gravity[a] = step.kick * ti.cast(run.gravity[a], float)
-        if ti.static(self.moves):
-            self.device.values.set_motions(run.w, self.device.motion, run.time, run.time + run.dt)
-            self.device.motion.advance(run.w, run.dt)
-        if ti.static(self.rigid):
-            self.device.rigid.begin(run.w, run.dt, step.kick, self.gravity_of(step))
-        for g in ti.static(range(len(self.members))):
-            # A law may have no particle yet.
-            step.rate[g] = 0.0 if ti.static(self.device.comes_and_goes) else NOTHING
-            step.volume_change[g] = 0.0
 
     @ti.func
     def first_of_step(self, run: ti.template()):

@@ -19,6 +19,7 @@ from mpmcli.solver.grid.grid import Grid
 from mpmcli.solver.particles.arrays import ParticleArrays
 from mpmcli.solver.particles.inflow import Emission
 from mpmcli.solver.particles.sort import TileOrder
+from mpmcli.solver.particles.state_bounds import NOTHING
 from mpmcli.solver.transfer.node_update import NodeUpdate
 from mpmcli.solver.transfer.particle_update import NOT_LOST, ParticleUpdate
 from mpmcli.solver.transfer.splines import PAD
@@ -171,11 +172,13 @@ class RunPhases:
     Attributes:
         values: the numbers of the step of each run, see `run_state.STEP`.
         members: (number, group) of each law.
+        moves, rigid: whether colliders move, as they are told or freely.
     """
 
     def __init__(self, device: Device, layout: Layout) -> None:
         self.device, self.layout, self.dimension = device, layout, device.grid.dimension
         self.members = tuple(enumerate(device.groups))
+        self.moves, self.rigid = device.motion is not None, device.rigid is not None
         self.values = ti.field(float, shape=(device.runs, layout.widths["step"]))
 
     def state(self, w: object, numbers: object, counts: object) -> RunState:
@@ -189,6 +192,37 @@ class RunPhases:
     def step_on_host(self, values: np.ndarray) -> StepState:
         """Return the numbers of the steps of all runs, in `values`."""
         return StepState(self.layout, values, slice(None))
+
+    @ti.func
+    def begin_step(self, run: ti.template()):
+        """Store the numbers of a step that was chosen, and put colliders in place."""
+        (step,) = ti.static((self.step_of(run.w),))
+        step.dt = ti.cast(run.dt, float)
+        step.kick = ti.cast(run.kick, float)
+        step.stable = ti.cast(run.stable, float)
+        step.relaxed = ti.cast(run.relaxed, float)
+        if ti.static(self.device.values.gravity_varies):
+            pulled = self.device.gravity.in_step(step.kick, run.w)
+            for a in ti.static(range(self.dimension)):
+                step.gravity[a] = pulled[a]
+        else:
+            for a in ti.static(range(self.dimension)):
+                step.gravity[a] = step.kick * ti.cast(run.gravity[a], float)
+        if ti.static(self.moves):
+            self.device.values.set_motions(run.w, self.device.motion, run.time, run.time + run.dt)
+            self.device.motion.advance(run.w, run.dt)
+        if ti.static(self.rigid):
+            self.device.rigid.begin(run.w, run.dt, step.kick, self.gravity_of(step))
+        self.forget_extremes(step)
+
+    @ti.func
+    def forget_extremes(self, step: ti.template()):
+        """Begin to look for the largest speed and rates of a step."""
+        step.speed_squared = 0.0
+        for g in ti.static(range(len(self.members))):
+            # A law may have no particle yet.
+            step.rate[g] = 0.0 if ti.static(self.device.comes_and_goes) else NOTHING
+            step.volume_change[g] = 0.0
 
     @ti.func
     def end_step(self, run: ti.template()):

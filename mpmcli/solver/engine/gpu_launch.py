@@ -245,8 +245,7 @@ class GpuLaunch:
         self.phases, self.shifts = GpuPhases(device, layout, doubles=doubles), device.grid.fine is not None
         self.steps = StepSize.of(device, layout, device.values if doubles else HostValues(device.values))
         self.sorts, self.moved = device.sorts, sorted_fields(groups)
-        self.rigid = device.rigid is not None
-        self.averages, self.moves = any(group.uses_f_bar for group in groups), device.motion is not None
+        self.averages = any(group.uses_f_bar for group in groups)
         self.loads = device.colliders.loads.rows * device.colliders.loads.capacity if device.nodes.collides else 0
         runs, widest = self.runs, max(entries(group) for group in groups)
         self.counts, self.numbers = self.phases.counts, self.phases.numbers
@@ -318,7 +317,7 @@ class GpuLaunch:
         if shifts:
             self.step(SHIFT)
         self.step(FIRST)
-        if self.rigid:
+        if self.phases.rigid:
             for _ in range(ROUNDS):
                 self.step(ROUND)
             self.step(LAST)
@@ -344,7 +343,7 @@ class GpuLaunch:
                     if self.begun[w] == 0:
                         self.begin(w)
                     self.begun[w] = ti.static(int(part == SHIFT)) * self.stepping[w]
-                self.prepare(w, part)
+                self.prepare(w)
         for phase, turn in ti.static(self.phases_of(part)):
             if ti.static(phase.over != "particles"):
                 kind = ti.static(OVER.index(phase.over))
@@ -357,7 +356,7 @@ class GpuLaunch:
                     w = p // self.capacity[phase.group]
                     if self.stepping[w] == 1 and self.takes_part(phase.group, w, p):
                         self.phases.do(phase, turn, w, p)
-        if ti.static(self.doubles and part == (LAST if self.rigid else FIRST)):
+        if ti.static(self.doubles and part == (LAST if self.phases.rigid else FIRST)):
             for w in range(self.runs):
                 if self.stepping[w] == 1:
                     self.end(w)
@@ -373,40 +372,24 @@ class GpuLaunch:
         """Choose the step of a run that goes on."""
         self.stepping[w] = 0
         (run,) = ti.static((self.phases.run(w),))
-        (step,) = ti.static((self.phases.step_of(w),))
         rests = run.drift >= as_double(self.device.drift_allowed) or run.due <= run.time
         if run.status == GOING and run.budget > 0 and not rests:
             if self.steps.begin(run):
                 self.stepping[w] = 1
-                step.dt = ti.cast(run.dt, float)
-                step.kick = ti.cast(run.kick, float)
-                step.stable = ti.cast(run.stable, float)
-                step.relaxed = ti.cast(run.relaxed, float)
-                for a in ti.static(range(self.dimension)):
-                    step.gravity[a] = step.kick * ti.cast(run.gravity[a], float)
-                if ti.static(self.moves):
-                    self.device.values.set_motions(w, self.device.motion, run.time, run.time + run.dt)
-                    self.device.motion.advance(w, run.dt)
+                self.phases.begin_step(run)
 
     @ti.func
-    def prepare(self, w: int, part: ti.template()):
-        """Begin the step of a run that was chosen."""
+    def prepare(self, w: int):
+        """Begin the step of a run that was chosen, by the host where the device has no double precision."""
         (step,) = ti.static((self.phases.step_of(w),))
         if self.stepping[w] == 1:
-            if ti.static(self.device.values.gravity_varies):
+            if ti.static(self.device.values.gravity_varies and not self.doubles):
                 pulled = self.device.gravity.in_step(step.kick, w)
                 for a in ti.static(range(self.dimension)):
                     step.gravity[a] = pulled[a]
             if ti.static(self.device.grid.deterministic):
                 self.device.grid.fixed.set_step(w, ti.max(step.kick, step.stable))
-            step.speed_squared = 0.0
-            for g in ti.static(range(len(self.members))):
-                # A law may have no particle yet.
-                step.rate[g] = 0.0 if ti.static(self.device.comes_and_goes) else NOTHING
-                step.volume_change[g] = 0.0
-            if ti.static(part == FIRST and self.rigid):
-                (run,) = ti.static((self.phases.run(w),))
-                self.device.rigid.begin(w, run.dt, step.kick, self.phases.gravity_of(step))
+            self.phases.forget_extremes(step)
 
     @ti.func
     def end(self, w: int):

@@ -94,7 +94,7 @@ class StepSize:
         It cannot where it has collapsed, or where the host must fill time tables.
         """
         value, limit = self.stable_step(run)
-        run.step_limit = limit
+        run.step_limit, run.deformation = limit, self.deformation_limit(run)
         run.stable = ti.min(value, run.end)
         left = run.target - run.time
         steps = ti.max(ti.ceil(left / value - as_double(SLACK)), 1.0)
@@ -201,9 +201,8 @@ class StepSize:
 
     @ti.pyfunc
     def nearest(self, run: ti.template()):
-        """Return the smallest bound on the next step, s, and its code; store the bound by deformation."""
-        run.deformation = self.deformation_limit(run)
-        value, limit = nearer(run.stiffness, run.stiffness_limit, run.deformation, DEFORMING)
+        """Return the smallest bound on the next step, s, and its code."""
+        value, limit = nearer(run.stiffness, run.stiffness_limit, self.deformation_limit(run), DEFORMING)
         value = ti.min(value, run.held)
         value, limit = nearer(value, limit, self.speed_limit(run, value), CROSSING)
         value, limit = nearer(value, limit, run.force, FORCE)
