@@ -78,7 +78,7 @@ TRANSFERS = (
 )
 DRIVES = (
     *_of(
-        "solver/engine/cpu_phases.py",
+        "solver/engine/device.py",
         ("step.kick * ti.cast", "1.05 * step.kick * ti.cast", "take_off"),
     ),
     *_of(

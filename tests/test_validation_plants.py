@@ -108,14 +108,14 @@ PLANTS = (
     ),
     Plant(
         "gravity upwards",
-        "solver/engine/cpu_phases.py",
+        "solver/engine/device.py",
         "step.kick * ti.cast",
         "-step.kick * ti.cast",
         ("dam_break",),
     ),
     Plant(
         "half of gravity",
-        "solver/engine/cpu_phases.py",
+        "solver/engine/device.py",
         "step.kick * ti.cast",
         "0.5 * step.kick * ti.cast",
         ("dam_break",),
