@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 import state_run
 from test_batch import scene_named
+from test_rigid_bodies import box
+from test_rigid_bodies import scene as scene_with
 
 from mpmcli.solver.engine.run import build_run
 
@@ -30,12 +32,19 @@ def test_a_run_on_a_gpu_follows_the_cpu(backend_of: Callable) -> None:
     assert np.abs(torque - expected_torque).max() < 1e-3 * np.abs(expected_torque).max()
 
 
-def test_rigid_bodies_on_a_gpu_follow_those_on_the_cpu(backend_of: Callable) -> None:
-    """A raft that falls into water while it turns, and a wheel with a motor.
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_rigid_bodies_on_a_gpu_follow_those_on_the_cpu(backend_of: Callable, dimension: int) -> None:
+    """A raft that falls into water while it turns, and a wheel with a motor; in 3D jelly hits a box above a floor.
 
     Poses and what the material loses agree to single precision, and a frame forgets what it has told.
     """
-    scene, steps, dt = state_run.scene_named("rigid"), 150, 2e-4
+    if dimension == 2:
+        scene, steps, dt = state_run.scene_named("rigid"), 150, 2e-4
+    else:
+        turning = {"shape": box([0.52, 0.001, 0.4], [0.8, 0.2, 0.6]), "axis": [1, 2, 3], "angular_velocity": 4.0}
+        shape = box([0.3, 0.05, 0.4], [0.5, 0.3, 0.65])
+        jelly, steps, dt = {"velocity": [3.0, 0.0, 0.0], "shape": shape}, 30, 2e-4
+        scene = scene_with(3, 0.0, turning, jelly=jelly, solver={"precision": "f32"})
     found = []
     for arch in ("vulkan", "cpu"):
         run = build_run(scene, backend_of("f32", 1, arch))

@@ -521,7 +521,8 @@ class CpuPhases(RunPhases):
     def move_bodies(self, at: ti.template()):
         """Move rigid bodies, with what the nodes lost to them."""
         if at.region == 0 and at.part == 0:
-            self.move_rigid(at)
+            for turn in ti.static(range(3)):
+                self.move_rigid(at, turn)
 
     @ti.func
     def advance(self, at: ti.template()):

@@ -253,11 +253,14 @@ class RunPhases:
         return ti.static((RunView(self.device, run, step, h, inverse, scale, box, last, extent),))
 
     @ti.func
-    def move_rigid(self, at: ti.template()):
-        """Move rigid bodies, with what the nodes lost to them."""
-        at.nodes.rigid.take(at.w, at.run.dt)
-        self.device.rigid_contact.resolve(at.w, at.run.dt, at.particles.extent, at.nodes.colliders)
-        ti.atomic_max(at.step.speed_squared, at.nodes.rigid.move(at.w, at.run.dt))
+    def move_rigid(self, at: ti.template(), turn: ti.template()):
+        """Give rigid bodies what nodes lost to them, in turn 0, resolve their contact, and move them, in turn 2."""
+        if ti.static(turn == 0):
+            at.nodes.rigid.take(at.w, at.run.dt)
+        if ti.static(turn == 1):
+            self.device.rigid_contact.resolve(at.w, at.run.dt, at.particles.extent, at.nodes.colliders)
+        if ti.static(turn == 2):
+            ti.atomic_max(at.step.speed_squared, at.nodes.rigid.move(at.w, at.run.dt))
 
     @ti.func
     def gravity_of(self, step: ti.template()):

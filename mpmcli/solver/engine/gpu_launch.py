@@ -164,8 +164,8 @@ class GpuPhases(RunPhases):
 
     @ti.func
     def move_bodies(self, at: ti.template()):
-        """Move rigid bodies."""
-        self.move_rigid(at)
+        """Move rigid bodies, in three turns."""
+        self.move_rigid(at, at.turn)
 
     @ti.func
     def add_loads(self, at: ti.template()):
@@ -221,9 +221,11 @@ class GpuPhases(RunPhases):
 
 # Most steps of a launch, after which the host attends to the runs that need it.
 STEPS = 32
-# Parts of a step, a launch each: what shifts particles, in few steps; the phases until rigid bodies meet nodes, or all;
-# a round of that; and the rest.
-SHIFT, FIRST, ROUND, LAST = range(4)
+# Launches of a step: what shifts particles, in few steps; all phases, or those until bodies meet nodes; a round of
+# that. Each turn of a phase after it is a launch, as drivers may take minutes to compile those of bodies beside others.
+SHIFT, FIRST, ROUND = range(3)
+# Turns on a GPU of a round, and of the phase that moves bodies.
+TURNS = {"meet": 2, "move_bodies": 3}
 # What phases run over beside particles, see `Phase`.
 OVER = ("nodes", "planes", "rows", "loads", "bodies")
 
@@ -234,6 +236,7 @@ class GpuLaunch:
 
     Attributes:
         phases: their bodies, and the numbers of runs that these read; steps: how a step is chosen.
+        parts: the phases of each launch of a step, with their turns.
         doubles: whether the device has double precision; shifts: whether some steps shift particles.
         reach: the largest number of items of a run of each kind, see OVER.
     """
@@ -243,6 +246,7 @@ class GpuLaunch:
         self.dimension, self.runs, groups = device.grid.dimension, device.runs, device.groups
         self.capacity, self.members = tuple(device.capacity), tuple(enumerate(groups))
         self.phases, self.shifts = GpuPhases(device, layout, doubles=doubles), device.grid.fine is not None
+        self.parts = self._parts()
         self.steps = StepSize.of(device, layout, device.values if doubles else HostValues(device.values))
         self.sorts, self.moved = device.sorts, sorted_fields(groups)
         self.averages = any(group.uses_f_bar for group in groups)
@@ -320,23 +324,27 @@ class GpuLaunch:
         if self.phases.rigid:
             for _ in range(ROUNDS):
                 self.step(ROUND)
-            self.step(LAST)
+            for part in range(ROUND + 1, len(self.parts)):
+                self.step(part)
 
-    def phases_of(self, part: int) -> list[tuple[Phase, int]]:
-        """Return the phases of a part of a step, with their turns."""
-        phases = self.device.phases
-        meet = next((k for k, phase in enumerate(phases) if phase.name == "meet"), len(phases))
-        own = {
-            SHIFT: [phase for phase in phases if phase.shifts],
-            FIRST: [phase for phase in phases[:meet] if not phase.shifts],
-            ROUND: phases[meet : meet + 1],
-            LAST: phases[meet + 1 :],
-        }
-        return [(phase, turn) for phase in own[part] for turn in range(2 if part == ROUND else phase.turns)]
+    def _parts(self) -> list[list[tuple[Phase, int]]]:
+        """Return the phases of each launch of a step, with their turns."""
+        parts: list[list[tuple[Phase, int]]] = [[], []]
+        for phase in self.device.phases:
+            turns = [(phase, turn) for turn in range(TURNS.get(phase.name, phase.turns))]
+            if phase.shifts:
+                parts[SHIFT] += turns
+            elif phase.name == "meet":
+                parts.append(turns)
+            elif len(parts) == ROUND:
+                parts[FIRST] += turns
+            else:
+                parts += [[one] for one in turns]
+        return parts
 
     @ti.kernel
     def step(self, part: ti.template()):
-        """Carry out a part of a step of every run that goes on; the first one begins it, and the last one ends it."""
+        """Carry out a launch of a step of every run that goes on; the first one begins it, and the last one ends it."""
         if ti.static(part in (SHIFT, FIRST)):
             for w in range(self.runs):
                 if ti.static(self.doubles):
@@ -344,7 +352,7 @@ class GpuLaunch:
                         self.begin(w)
                     self.begun[w] = ti.static(int(part == SHIFT)) * self.stepping[w]
                 self.prepare(w)
-        for phase, turn in ti.static(self.phases_of(part)):
+        for phase, turn in ti.static(self.parts[part]):
             if ti.static(phase.over != "particles"):
                 kind = ti.static(OVER.index(phase.over))
                 for q in range(self.runs * self.reach[kind]):
@@ -356,7 +364,7 @@ class GpuLaunch:
                     w = p // self.capacity[phase.group]
                     if self.stepping[w] == 1 and self.takes_part(phase.group, w, p):
                         self.phases.do(phase, turn, w, p)
-        if ti.static(self.doubles and part == (LAST if self.phases.rigid else FIRST)):
+        if ti.static(self.doubles and part == len(self.parts) - 1):
             for w in range(self.runs):
                 if self.stepping[w] == 1:
                     self.end(w)
