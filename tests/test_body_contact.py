@@ -136,7 +136,8 @@ def test_pairs_that_cannot_be_are_one_sentence(pairs: list, said: str) -> None:
 @pytest.mark.parametrize(
     ("tables", "arch", "reason"),
     [
-        ({}, "vulkan", "with --arch vulkan"),
+        ({}, "metal", "with --arch metal"),
+        ({"solver": {"deterministic": True}}, "vulkan", "with solver.deterministic = true on a GPU"),
         ({"solver": {"solids": "total"}, "domain": {"walls": "separate"}}, "cpu", 'with solver.solids = "total"'),
         ({"solver": {"grid": "sparse"}}, "cpu", "on a sparse grid"),
         ({"domain": {"walls": {"x_min": "periodic", "x_max": "periodic"}}}, "cpu", "in a domain with periodic walls"),

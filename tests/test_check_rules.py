@@ -16,6 +16,7 @@ from mpmcli.check.step_rules import HALF_ULP, LOST_MOTION, STRESS_NOISE
 from mpmcli.errors import InputError
 from mpmcli.materials.registry import laws
 from mpmcli.scene import LoadedScene
+from mpmcli.scene.problem import listed, quoted
 
 H = 1 / 64
 SAND = {"law": "sand", "density": 1600.0, "youngs_modulus": 1e7}
@@ -159,10 +160,13 @@ def test_strains_of_a_stiff_cube(youngs_modulus: float, fires: bool) -> None:
 
 @pytest.mark.parametrize(("ratio", "fires"), [(0.49, False), (0.495, True)])
 def test_locking(ratio: float, fires: bool) -> None:
-    """Poisson's ratio above 0.49: it locks without F-bar, and with it steps are small."""
-    for f_bar, severity in (("auto", "note"), (True, "note"), (False, "warning")):
-        findings = found("locking", material=SOLID | {"poissons_ratio": ratio}, solver={"f_bar": f_bar})
-        assert [finding.severity for finding in findings] == [severity] * fires
+    """Poisson's ratio above 0.49: it locks without F-bar, and with it steps are small and take more of a wave."""
+    material = SOLID | {"poissons_ratio": ratio}
+    for f_bar in ("auto", True, False):
+        findings = found("locking", material=material, solver={"f_bar": f_bar})
+        assert [finding.severity for finding in findings] == ["warning"] * (fires and f_bar is False)
+    (loss,) = found("dissipation", material=material)
+    assert ("poissons_ratio = 0.49 or less" in loss.fix) == fires
 
 
 @pytest.mark.parametrize(("light", "fires"), [(10.0, False), (9.9, True)])
@@ -369,6 +373,27 @@ def test_what_slides_on_the_floor_is_said(material: object, walls: dict, fires: 
     """Grains, mud and viscous liquids on a floor without friction; walls at the sides do not count."""
     domain = {"gravity": [0.0, -10.0]} | walls
     assert len(found("slippery", domain=domain, material=material)) == fires
+
+
+def test_the_text_says_once_what_concerns_several_bodies() -> None:
+    """Findings that differ in the body alone are one; of losses the largest; JSON has them all."""
+    sizes = {"a": 0.1, "b": 0.2, "c": 0.15, "d": 0.1}
+    bodies = [
+        block(name, [0.25 * k + 0.02, 0.5], [0.25 * k + 0.02 + size, 0.5 + size]) | {"material": SOLID}
+        for k, (name, size) in enumerate(sizes.items())
+    ]
+    for body in bodies[2:]:
+        body["particles_per_cell"] = 1
+    checked = check(bodies)
+    losses = {f.body: f for f in checked.findings if f.rule == "dissipation"}
+    assert set(losses) == set("abcd")
+    lines = checked.text().splitlines()
+    (loss,) = (line for line in lines if "of the energy of a wave" in line)
+    worst = max(losses.values(), key=lambda f: f.value)
+    assert loss == f"{worst.line} As much or less for {listed(quoted(sorted(set('abcd') - {worst.body})), 'and')}."
+    (few,) = (line for line in lines if "one particle per cell" in line)
+    assert few.endswith('Set particles_per_cell = 4 or more. The same for "d".') and 'Body "c"' in few
+    assert lines[-1] == f"ok: 1 warning, {sum(line.startswith('note: ') for line in lines)} notes"
 
 
 @pytest.mark.parametrize(

@@ -159,11 +159,64 @@ def test_what_turns_has_an_arrow_at_its_rim(tmp_path: Path) -> None:
     flat = TURNING.replace("axis = [0.0, 2.0, 0.0]", "")
     for numbers in ("1.0, 0.6, 0.5", "0.8, 0.2, 0.2", "0.9, 0.3, 0.3", "0.3, 0.2, 0.1", "0.7, 0.3, 0.4"):
         flat = flat.replace(numbers, numbers.rpartition(",")[0])
-    for text, rim in ((TURNING, ((0.7, 0.25, 0.25), (0.0, 0.0, -0.4))), (flat, ((0.7, 0.25), (0.0, 0.4)))):
+    for text, rim in ((TURNING, ((0.7, 0.25, 0.25), (0.0, 0.0, -1.0))), (flat, ((0.7, 0.25), (0.0, 1.0)))):
         scene.write_text(text, encoding="utf-8")
         with result_of_start(load_scene(scene, laws=parameter_models()).scene) as (_, arrows):
-            ((place, velocity),) = arrows
-        assert place == pytest.approx(rim[0]) and velocity == pytest.approx(rim[1])
+            ((place, direction, speed),) = arrows
+        assert place == pytest.approx(rim[0]) and direction == pytest.approx(rim[1]) and speed == "0.4 m/s"
+
+
+LOADED = """
+[domain]
+size = [1.0, 0.6]
+spacing = 0.05
+[time]
+end = 2.0
+frames = 1
+[[bodies]]
+name = "bar"
+material = "jelly"
+shape = { box = { min = [0.2, 0.2], max = [0.8, 0.4] } }
+[[colliders]]
+name = "grip"
+shape = { box = { min = [0.1, 0.1], max = [0.3, 0.5] } }
+wall = "hold"
+[[forces]]
+body = "bar"
+force = [0.0, "-25 * t"]
+region = { box = { min = [0.7, 0.2], max = [0.8, 0.4] } }
+[[forces]]
+body = "bar"
+acceleration = [5.0, 0.0]
+[[forces]]
+body = "bar"
+acceleration = ["X - 0.5", 0.0]
+"""
+
+
+def test_the_start_of_a_scene_shows_loads_and_held_parts(tmp_path: Path) -> None:
+    """A force spread over a region acts at its centre; an acceleration is a force of m a; what cancels has no arrow."""
+    scene = tmp_path / "loaded.toml"
+    scene.write_text(LOADED, encoding="utf-8")
+    loaded = load_scene(scene, laws=parameter_models()).scene
+    with result_of_start(loaded) as (_, arrows):
+        load, push = arrows
+    weight = loaded.bodies[0].material.density * 0.6 * 0.2 * 5.0
+    assert load[0] == pytest.approx((0.75, 0.3)) and load[2] == "50 N/m"
+    assert push[0] == pytest.approx((0.5, 0.3)) and push[2] == f"{weight:.3g} N/m"
+    assert push[1] == pytest.approx((1.0, 0.0)) and load[1] == pytest.approx((0.0, -50.0 / weight))
+    shown = {}
+    for colliders in ("solid", "none"):
+        picture = tmp_path / f"{colliders}.png"
+        run_here("render", scene, "-o", picture, "--colliders", colliders, "--workers", 1)
+        with Image.open(picture) as image:
+            shown[colliders] = np.asarray(image.convert("RGB")).astype(int)
+    changed = np.argwhere(np.abs(shown["solid"] - shown["none"]).max(axis=2) > 0)
+    walls = np.flatnonzero((np.abs(shown["none"] - [0x3F, 0x48, 0x56]).max(axis=2) < 9).sum(axis=0) > 300)
+    metre = walls.max() - walls.min()
+    height, width = np.ptp(changed, axis=0) / metre
+    assert (width, height) == pytest.approx((0.2, 0.4), abs=0.01)
+    assert 0.15 < len(changed) / (0.2 * 0.4 * metre**2) < 0.4
 
 
 def test_stdout_gets_the_paths_that_were_asked_for(run: Path, tmp_path: Path) -> None:

@@ -328,3 +328,9 @@ def test_scipy_is_loaded_only_where_a_sequence_is_drawn(run_python):
         "print('scipy.stats' in sys.modules)\n"
     )
     assert run_python(code).stdout.splitlines()[-1] == "False"
+
+
+def test_one_entry_of_a_velocity_that_the_base_scene_lacks_is_drawn_and_the_others_are_zero():
+    sweep = sweep_of(varied('"bodies.stone.velocity.0" = { uniform = [1, 2] }'))
+    velocity = draw(sweep, 3).scene(LAWS).scene.bodies[1].velocity
+    assert velocity == (draw(sweep, 3).values["bodies.stone.velocity.0"], 0.0) and 1 <= velocity[0] <= 2

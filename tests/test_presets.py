@@ -145,6 +145,21 @@ def test_a_knob_works_with_a_law_too():
     assert loaded.notes == ("pool: springiness = 0.5 sets youngs_modulus = 1e+05 Pa",)
 
 
+def test_a_choice_for_several_bodies_is_said_once():
+    text = SCENE.format(
+        size=[1.0, 1.0],
+        gravity=[0.0, 0.0],
+        low=[0.0, 0.0],
+        high=[0.1, 0.1],
+        material='{ preset = "jelly", springiness = 0.5 }',
+    )
+    data = tomllib.loads(text)
+    boxes = [{"box": {"min": [0.1 * k, 0.0], "max": [0.1 * k + 0.1, 0.1]}} for k in range(8)]
+    data["bodies"] = [data["bodies"][0] | {"name": f"b{k}", "shape": box} for k, box in enumerate(boxes)]
+    (note,) = parse_scene(data, laws=parameter_models()).notes
+    assert note.startswith("b0, b1, b2, b3, b4 and 3 more: springiness = 0.5 sets youngs_modulus = ")
+
+
 def test_stiffness_makes_a_fluid_less_compressible_and_slower():
     soft, stiff = (material_of(f'{{ preset = "water", stiffness = {k} }}') for k in (0, 1))
     assert (soft.compressibility, stiff.compressibility) == (0.1, 1e-4)

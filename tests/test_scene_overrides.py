@@ -32,6 +32,8 @@ DATA = {
         ("bodies.0.velocity=[1, 0]", ("bodies", 0, "velocity"), [1, 0]),
         ("bodies[0].velocity=[1, 0]", ("bodies", 0, "velocity"), [1, 0]),
         ("bodies.column.velocity=[1, 0]", ("bodies", 0, "velocity"), [1, 0]),
+        ("bodies.column.velocity.1=-2.0", ("bodies", 0, "velocity"), [0, -2]),
+        ("domain.gravity[1]=-9.81", ("domain", "gravity"), [0, -9.81]),
         ("bodies.column.shape.box.max[1]=0.25", ("bodies", 0, "shape", "box", "max", 1), 0.25),
         ("domain.walls={default = 'slip'}", ("domain", "walls"), {"default": "slip"}),
         ("output.compress=true", ("output", "compress"), True),
@@ -43,7 +45,8 @@ def test_an_override_sets_one_value(override, path, value):
     for part in path:
         at = at[part]
     assert at == value
-    assert placed == {path: f"--set {override}"}
+    (place,) = placed
+    assert place[: len(path)] == path and placed[place] == f"--set {override}"
     assert DATA["time"]["end"] == 1.0 and "velocity" not in DATA["bodies"][0]
 
 
@@ -71,6 +74,10 @@ def test_later_overrides_see_earlier_ones():
         ("bodies.colum.velocity=1", 'no entry of bodies has the name "colum"; did you mean "column"?'),
         ("bodies.x.velocity=1", 'no entry of bodies has the name "x"; the names are column'),
         ("bodies.1.velocity=1", "bodies has 1 entry, counted from 0; there is no bodies[1]"),
+        (
+            "bodies.0.velocity.2=1",
+            "bodies[0].velocity has 2 entries, counted from 0; there is no bodies[0].velocity[2]",
+        ),
         ("domain.size.x=1", 'domain.size is a list: give an index, domain.size[0], for "x"'),
         ("title.a=1", 'title is "t" and holds no a; replace it as a whole, title={a = ...}'),
     ],

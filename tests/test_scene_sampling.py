@@ -89,7 +89,7 @@ SHAPES = {
     ("way", "name"),
     [*((way, name) for way in ("lattice", "jittered") for name in SHAPES), ("poisson", "disc"), ("poisson", "polygon")],
 )
-def test_mass_is_exact_and_the_estimate_close(name, way):
+def test_mass_and_count_are_exact_and_the_estimate_close(name, way):
     size, shape = SHAPES[name]
     scene = scene_of({"shape": shape, "sampling": way}, size=size)
     (particles,) = sample_bodies(scene)
@@ -98,6 +98,7 @@ def test_mass_is_exact_and_the_estimate_close(name, way):
     assert particles.count * particles.volume == pytest.approx(form.volume, rel=1e-12)
     assert particles.count * particles.mass == pytest.approx(800 * form.volume, rel=1e-12)
     assert abs(particles.count - estimate_particles(scene)) < 0.05 * particles.count
+    assert sampling.count_particles(scene) == particles.count
 
 
 def test_a_disc_on_a_lattice_is_symmetric():

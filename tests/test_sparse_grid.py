@@ -15,6 +15,7 @@ from mpmcli.boundaries.walls import REACH
 from mpmcli.errors import InputError
 from mpmcli.frames.frame import Frame
 from mpmcli.scene import Scene, sample_bodies
+from mpmcli.scene.forces import Contact
 from mpmcli.solver.engine import batch
 from mpmcli.solver.engine.run import build_run
 from mpmcli.solver.grid.sparse_grid import first_nodes_of, reach_along, tiles_reached, wants_sparse
@@ -173,12 +174,19 @@ def test_what_an_emitter_lets_in_has_nodes(backend_of: Callable) -> None:
 
 
 def test_scenes_choose_their_grid() -> None:
-    """A large domain that is nearly empty has a sparse one, unless asked otherwise, and any other a dense one."""
+    """A large domain that is nearly empty has a sparse one, unless asked otherwise, and any other a dense one.
+
+    Bodies that separate need a dense one.
+    """
     ball = {"name": "ball", "material": FLUID, "shape": {"ball": {"center": [0.5] * 3, "radius": 0.06}}}
     large = scene((512,) * 3, 1 / 512, [ball], 0.1)
     assert wants_sparse(large)
     assert not wants_sparse(changed(large, grid="dense"))
     assert not wants_sparse(scene((512,) * 3, 1 / 512, [block("sea", FLUID, (0, 0, 0), (1, 0.2, 1))], 0.1))
+    jelly = {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 1e5, "poissons_ratio": 0.3}
+    elastic = scene((512,) * 3, 1 / 512, [ball | {"material": jelly}], 0.1)
+    assert wants_sparse(elastic)
+    assert not wants_sparse(elastic.model_copy(update={"contact": Contact(default="separate")}))
     assert not wants_sparse(drop(grid="auto"))
     assert wants_sparse(drop())
 

@@ -13,7 +13,7 @@ from mpmcli.check.finding import passes
 from mpmcli.check.scene_check import check_scene
 from mpmcli.dataset.draw import draw
 from mpmcli.dataset.sweep_file import load_sweep
-from mpmcli.dataset.sweep_run import SweepSettings, run_sweep
+from mpmcli.dataset.sweep_run import SweepSettings, rehearse, run_sweep
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import estimate_particles, load_scene
 
@@ -74,10 +74,12 @@ def test_a_shortened_sweep_runs(tmp_path):
     copy.write_text(path.read_text(encoding="utf-8"), encoding="utf-8")
     sweep = load_sweep(copy, laws=LAWS, count=2)
     settings = SweepSettings(tmp_path / "set", workers=1)
+    forecast = [one.particles for one in rehearse(sweep, settings).trajectories]
     state = run_sweep(sweep, settings)
     assert (state.status, state.accepted) == ("finished", 2)
     dataset = mpmcli.dataset.open(tmp_path / "set")
     assert [each.frame_count for each in dataset] == [3, 3]
+    assert [each.position.shape[1] for each in dataset] == forecast
     card = Path(tmp_path / "set" / "README.md").read_bytes()
     run_sweep(sweep, replace(settings, resume=True))
     assert Path(tmp_path / "set" / "README.md").read_bytes() == card

@@ -1,14 +1,18 @@
 """Findings of a check: each states what is wrong, the number that shows it, and what to change."""
 
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Literal
 
 from mpmcli.plain_text import counted
+from mpmcli.scene.problem import quoted, several
 
 Severity = Literal["error", "warning", "note"]
 # Of a run; a check of its files finds the first three, the others stopped it.
 Verdict = Literal["stable", "suspect", "unstable", "escaped", "failed"]
+# Rules on what the transfers take.
+LOSSES = ("dissipation", "impact-loss", "numerical-viscosity")
 # In decreasing order of severity.
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 
@@ -34,6 +38,26 @@ class Finding:
 def gravest_first(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     """Return the findings, errors before warnings before notes, otherwise in their order."""
     return tuple(sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity)))
+
+
+def merged(findings: Iterable[Finding]) -> list[Finding]:
+    """Return findings as a text has them: one that names all bodies for those that say the same of each.
+
+    Those of a rule in LOSSES say the same with other numbers, too; the largest loss is reported.
+    """
+    alike: dict[tuple[str, ...], list[tuple[Finding, str]]] = {}
+    for finding in findings:
+        said = finding.line.replace(f'"{finding.body}"', "")
+        kind = re.sub(r"\d[\d.e+-]*", "", said) if finding.rule in LOSSES else said
+        alike.setdefault((finding.severity, finding.rule, kind), []).append((finding, said))
+    result = []
+    for group in alike.values():
+        first = max((finding for finding, _ in group), key=lambda one: one.value or 0.0)
+        others = [one.body for one, _ in group if one is not first and one.body]
+        same = "The same" if len({said for _, said in group}) == 1 else "As much or less"
+        fix = f"{first.fix} {same} for {several(quoted(others))}." if others else first.fix
+        result.append(replace(first, fix=fix))
+    return result
 
 
 def passes(findings: Iterable[Finding], *, strict: bool = False) -> bool:

@@ -76,14 +76,10 @@ def _soft(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
 
 def _locking(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
     ratio = getattr(body.body.material, "poissons_ratio", 0.0)
-    if ratio <= LOCKING:
+    # With F-bar its steps are small and damp what moves, which is in the finding on dissipation.
+    if ratio <= LOCKING or (facts.scene.solver.f_bar is not False and not body.flows):
         return
     has = f'Body "{body.name}" has a Poisson\'s ratio of {ratio:g}'
-    if facts.scene.solver.f_bar is not False and not body.flows:
-        lost = "its steps are small, and as each of them damps what moves, it swings less far than it should."
-        fix = f"Set poissons_ratio = {LOCKING:g} or less, where the difference does not matter."
-        yield Finding("note", "locking", f"{has}: {lost}", fix, ratio, body.name)
-        return
     lost = f"above {LOCKING:g} it bends too stiffly, its pressure varies from particle to particle, and its steps are "
     fix = f"Set solver.f_bar = true, poissons_ratio = {LOCKING:g} or less, or model it as a fluid."
     yield Finding("warning", "locking", f"{has}: {lost}small.", fix, ratio, body.name)
@@ -128,9 +124,10 @@ def _slippery(facts: SceneFacts) -> Iterator[Finding]:
     gripping = [body.name for body in facts.bodies if _grips(body)]
     if gripping and domain.frictions[axis][side] == 0:
         face = f"{AXES[axis]}_{('min', 'max')[side]}"
-        what = f'Body "{gripping[0]}" slides on the wall {face}, which has no friction.'
         fix = f'Set domain.walls = {{ {face} = "stick" }}, or domain.friction = {{ {face} = 0.5 }}, if it should not.'
-        yield Finding("note", "slippery", what, fix, 0.0, gripping[0])
+        for name in gripping:
+            what = f'Body "{name}" slides on the wall {face}, which has no friction.'
+            yield Finding("note", "slippery", what, fix, 0.0, name)
 
 
 def _unpressed(facts: SceneFacts) -> Iterator[Finding]:

@@ -1,11 +1,12 @@
 """Check of a scene before the run: the safe step and its cause, findings, and a forecast; as data and as text."""
 
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 from mpmcli.check.facts import SceneFacts
-from mpmcli.check.finding import SEVERITIES, Finding, gravest_first, passes
+from mpmcli.check.finding import SEVERITIES, Finding, gravest_first, merged, passes
 from mpmcli.check.forecast import Forecast, Probe, forecast_of, output_findings
 from mpmcli.check.material_rules import material_findings
 from mpmcli.check.shape_rules import drive_findings, shape_findings
@@ -44,14 +45,17 @@ class SceneCheck:
         facts, first, later = self.facts, self.facts.binding_at_start, self.facts.binding
         steps = [f"Step that is safe throughout: {facts.step:.4g} s. {later.why} {later.fix}"]
         if first is not later:
-            steps.append(f"Step at the start: {facts.step_at_start:.4g} s. {first.why} {first.fix}")
-        counts = Counter(finding.severity for finding in self.findings)
+            same = (first.name, first.body) == (later.name, later.body)
+            why = ", by the same limit." if same else f". {first.why} {first.fix}"
+            steps.append(f"Step at the start: {facts.step_at_start:.4g} s{why}")
+        findings = merged(self.findings)
+        counts = Counter(finding.severity for finding in findings)
         counted_findings = [counted(counts[word], word) for word in SEVERITIES if counts[word]]
         parts = [
             "\n".join(filter(None, [self.loaded.scene.title, *self.loaded.notes])),
             _limits_text(facts),
             "\n".join(steps),
-            _findings_text(self.findings),
+            _findings_text(findings),
             _plan_text(self.plan),
             _forecast_text(self.forecast),
             f"{'ok' if self.passes() else 'not ok'}: {', '.join(counted_findings) or 'nothing found'}",
@@ -146,7 +150,7 @@ def _limits_text(facts: SceneFacts) -> str:
     return table + (f"\nand {left_out} that bind less" if left_out else "")
 
 
-def _findings_text(findings: tuple[Finding, ...]) -> str:
+def _findings_text(findings: Iterable[Finding]) -> str:
     """Return one line for each finding, and of each rule the first MOST_ALIKE only."""
     lines, told = [], Counter[str]()
     for finding in findings:

@@ -9,6 +9,7 @@ from mpmcli.check.facts import BodyFacts, SceneFacts
 from mpmcli.check.finding import Finding
 from mpmcli.check.forecast import damped_step, expected_steps, steps_at, wave_loss
 from mpmcli.check.geometry import spanned_axes, touched_walls
+from mpmcli.check.material_rules import LOCKING
 from mpmcli.plain_text import plain_number
 from mpmcli.scene.bounds import highest_speed
 from mpmcli.scene.schema import USUAL_FLIP, SolverSettings
@@ -123,8 +124,10 @@ def _dissipation(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
         f'body "{body.name}", {body.thickness / h:.3g} cells thick, in a second, and {_percent(lost)} in the run.'
     )
     # A wave loses an eighth: a sixteenth in each of twice as many steps.
-    fix = f"Half the spacing lowers that to {_percent(-math.expm1(-rate * end / 8))} in the run."
-    yield Finding("note", "dissipation", what, fix, rate, body.name)
+    fix = f"Half the spacing lowers that to {_percent(-math.expm1(-rate * end / 8))} in the run"
+    if getattr(body.body.material, "poissons_ratio", 0.0) > LOCKING:
+        fix += f", and longer steps with poissons_ratio = {LOCKING:g} or less lower it as well"
+    yield Finding("note", "dissipation", what, f"{fix}.", rate, body.name)
 
 
 def _viscosity(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:

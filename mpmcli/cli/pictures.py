@@ -72,7 +72,7 @@ WIDEST = 3
 def render_command(result: Path, workers: int | None, quiet: bool, as_json: bool, **asked: Any) -> int:
     """Draw frames of a RESULT without a screen: pictures, a film (--movie) or a montage.
 
-    RESULT may be a scene (.toml): its start is drawn, with the velocities of bodies, emitters and colliders, into
+    RESULT may be a scene (.toml): its start is drawn, with velocities, forces on bodies and held parts, into
     <name of the scene>.png.
 
     RESULT may be a dataset: its montage shows evenly spaced trajectories at one frame, the middle one or --frame, and

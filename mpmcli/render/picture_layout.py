@@ -7,13 +7,17 @@ from functools import cache
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.ndimage import binary_erosion
 
 from mpmcli.render.coloring import Categories, Coloring
 from mpmcli.render.render_scene import RenderScene
 from mpmcli.render.settings import Arrow, Theme, rgb_bytes
 from mpmcli.render.view import View, corners_of
+from mpmcli.scene.colliders import Collider
+from mpmcli.scene.surface import collider_surface
 
 if TYPE_CHECKING:
+    from PIL.Image import Image
     from PIL.ImageDraw import ImageDraw
     from PIL.ImageFont import FreeTypeFont
 
@@ -91,6 +95,8 @@ class PictureLayout:
                     self._write(draw, x + min(self._px(PAD), free), y - self._label // 2, text)
             if self.walls:
                 self._walls(draw, view, (x, y))
+            for collider in self.scene.held:
+                self._hatch(whole, view, (x, y), collider)
             if self.arrows:
                 self._draw_arrows(draw, view, (x, y))
         if self.scale_bar:
@@ -194,14 +200,12 @@ class PictureLayout:
                 draw.rectangle(gap, fill=self.theme.ground)
 
     def _draw_arrows(self, draw: "ImageDraw", view: View, place: tuple[int, int]) -> None:
-        """Draw velocities, the fastest as long as a part of the domain, each with its speed in m/s."""
+        """Draw the arrows, the longest of a kind as long as a part of the domain, each with its magnitude."""
         flat = [0.0] * (3 - self.scene.dimension)
-        starts, velocities = (np.array([(*one[k], *flat) for one in self.arrows]) for k in (0, 1))
-        speeds = np.linalg.norm(velocities, axis=1)
-        longest = ARROW * float(np.ptp([self.scene.lower, self.scene.upper], axis=0).max())
-        ends = starts + velocities * (longest / speeds.max())
+        starts, vectors = (np.array([(*one[k], *flat) for one in self.arrows]) for k in (0, 1))
+        ends = starts + ARROW * float(np.ptp([self.scene.lower, self.scene.upper], axis=0).max()) * vectors
         (tails, tips), width = (view.pixels(points)[:, :2] + place for points in (starts, ends)), self._px(3)
-        for tail, tip, speed in zip(tails, tips, speeds.tolist(), strict=True):
+        for tail, tip, (_, _, text) in zip(tails, tips, self.arrows, strict=True):
             length = float(np.linalg.norm(tip - tail))
             along = (tip - tail) / max(length, 1.0)
             head = min(self._px(12), length)
@@ -209,8 +213,37 @@ class PictureLayout:
             draw.line([*map(tuple, (tail, tip - 0.8 * head * along))], self.theme.text, width)
             draw.polygon([*map(tuple, (tip, *wings))], self.theme.text)
             beside, anchor = tip + self._px(SMALL) * along, "lm" if along[0] >= 0 else "rm"
-            halo = {"stroke_width": self._px(2), "stroke_fill": self.theme.ground}
-            draw.text(tuple(beside), f"{speed:.3g} m/s", self.theme.text, self._small, anchor=anchor, **halo)
+            self._write_over(draw, beside, text, anchor)
+
+    def _hatch(self, whole: "Image", view: View, place: tuple[int, int], collider: Collider) -> None:
+        """Hatch what a collider holds, also where something hides it, and write "held" there."""
+        from PIL import Image, ImageDraw
+
+        mask = Image.new("L", view.size)
+        if self.scene.dimension == 2:
+            low, high = np.sort(view.pixels(np.array([self.scene.lower, self.scene.upper]))[:, :2], axis=0)
+            columns, rows = (np.arange(math.ceil(a), math.floor(b)) for a, b in zip(low, high, strict=True))
+            points = view.rays(columns[None, :], rows[:, None])[0][..., :2]
+            inside = collider.signed_distance(points.reshape(-1, 2), 0.0).reshape(points.shape[:2]) < 0.0
+            mask.paste(Image.fromarray(inside), (int(columns[0]), int(rows[0])))
+        else:
+            surface = collider_surface(collider, *map(np.array, (self.scene.lower, self.scene.upper)))
+            triangles = view.pixels(collider.motion.placed(surface.points, 0.0))[surface.cells]
+            for corners in triangles[(triangles[..., 2] > view.near).all(axis=1), :, :2]:
+                ImageDraw.Draw(mask).polygon([*map(tuple, corners)], 255)
+        covered = np.asarray(mask) > 0
+        if covered.any():
+            y, x = np.indices(covered.shape)
+            lines = (x + y) % self._px(10) < self._px(2)
+            rim = covered & ~binary_erosion(covered, iterations=self._px(2), border_value=1)
+            whole.paste(self.theme.wall, place, Image.fromarray(covered & lines | rim))
+            middle = np.argwhere(covered).mean(axis=0)[::-1] + place
+            self._write_over(ImageDraw.Draw(whole), middle, "held", "mm")
+
+    def _write_over(self, draw: "ImageDraw", place: np.ndarray, text: str, anchor: str) -> None:
+        """Write a small text that is legible on whatever is there."""
+        halo = {"stroke_width": self._px(3), "stroke_fill": self.theme.ground}
+        draw.text(tuple(place), text, self.theme.text, self._small, anchor=anchor, **halo)
 
     def _draw_scale_bar(self, draw: "ImageDraw", view: View) -> None:
         length = round_length(SCALE_SHARE * self.size[0] / view.pixels_per_metre)

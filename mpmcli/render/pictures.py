@@ -89,7 +89,8 @@ def set_up(result: Result, settings: Settings) -> RenderSetup:
     """Return what the pictures of a result share, and fill in what the settings leave open."""
     scene, theme = render_scene_of(result), THEMES[settings.theme]
     colliders = () if settings.colliders == "none" else scene.colliders
-    scene = replace(scene, colliders=colliders, clear=settings.colliders == "clear")
+    held = () if settings.colliders == "none" or settings.arrows is None else scene.held
+    scene = replace(scene, colliders=colliders, held=held, clear=settings.colliders == "clear")
     hollow = _hollow(scene, result) if settings.colliders == "auto" else ()
     if settings.colliders == "auto" and not hollow:
         settings = replace(settings, colliders="solid")
@@ -113,7 +114,7 @@ def set_up(result: Result, settings: Settings) -> RenderSetup:
     # A scale bar has no meaning in perspective.
     parallel = view_of(scene, camera, (width, width)).parallel
     size, times = (width, height or width), expected_times(result)
-    layout = PictureLayout(size, scene, theme, times, colors, settings.grid, walls, parallel, settings.arrows)
+    layout = PictureLayout(size, scene, theme, times, colors, settings.grid, walls, parallel, settings.arrows or ())
     if height is None:
         aspect = min(max(aspect_of(scene, camera), FLATTEST), 1.0 / FLATTEST)
         for _ in range(FITTING_ROUNDS):
@@ -235,7 +236,7 @@ def picture_digest(result: Result, settings: Settings, ks: Sequence[int]) -> str
     labels = [time_text(float(result.times[k]), times) for k in ks]
     frames = [[int(result.numbers[k]), int(result.particle_counts[k]), repr(result.ledger[k])] for k in ks]
     # Pictures of earlier versions have no arrows, and stay right.
-    asked = {name: value for name, value in asdict(settings).items() if name != "arrows" or value}
+    asked = {name: value for name, value in asdict(settings).items() if name != "arrows" or value is not None}
     return settings_digest(
         {**asked, "scene": result.header.stored.get("scene", ""), "frames": frames, "labels": labels}
     )

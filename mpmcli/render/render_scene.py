@@ -1,7 +1,7 @@
 """The scene of a picture: the domain of a run, or of one to come, its materials, and particles drawn as one body."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,10 +20,11 @@ from mpmcli.output.store import SegmentStore
 from mpmcli.plain_text import one_line
 from mpmcli.render.particle_grid import drawable
 from mpmcli.render.settings import Arrow, lighter
-from mpmcli.scene import Scene, sample_bodies, scene_to_toml
+from mpmcli.scene import BodyParticles, Scene, sample_bodies, scene_to_toml
 from mpmcli.scene.colliders import Collider, Plane
+from mpmcli.scene.entry import value_of
 from mpmcli.scene.expand import PRESETS
-from mpmcli.scene.expression import evaluate
+from mpmcli.scene.expression import INITIAL, POSITION, evaluate
 from mpmcli.scene.schema import Emitter, usual_particles_per_cell
 from mpmcli.scene.sheets import sheets_of
 
@@ -66,6 +67,8 @@ UNSEEN = {"law", "surface_friction"}  # parameters that say nothing of what a ma
 ALIKE = 1e-12  # distance of materials below which they are the same
 PARALLEL = 0.9  # cosine above which an axis is too near to that of a rotation to be an arm
 NOTHING_YET = dict.fromkeys(("kinetic", "elastic", "potential", "mass", "speed_max", "courant_max"), 0.0)
+LOAD_TIMES = 32  # times of a run at which loads are evaluated
+COHERENT = 0.5  # least ratio of a resultant to the sum of the magnitudes of forces: a vortex has no arrow
 FAR = 1e6  # upper bound of the ratio of two values of a parameter in the distance between materials
 
 
@@ -115,6 +118,7 @@ class RenderScene:
     distances: tuple[float, ...]  # (b,) between neighbouring particles at the start, m
     densities: tuple[float, ...]  # (b,) at rest, kg/m^3
     colliders: tuple[Collider, ...] = ()  # that are drawn
+    held: tuple[Collider, ...] = ()  # colliders that hold a part, which are marked in the start of a scene
     collider_frames: tuple[int, ...] | None = None  # the frame that each collider is in; None where all are in all
     hollow: tuple[int, ...] = ()  # numbers of the colliders in 3D that are cut open, so that what is inside is seen
     towards: tuple[float, ...] = (0.0, 0.0, 0.0)  # the direction (3,) from which they are cut
@@ -155,6 +159,7 @@ def render_scene_of(result: Result) -> RenderScene:
         faces=header.faces,
         # What holds a part is no thing to be seen.
         colliders=tuple(result.colliders[k] for k in shown),
+        held=tuple(collider for collider in result.colliders if collider.holds),
         collider_frames=result.collider_frames and tuple(result.collider_frames[k] for k in shown),
     )
 
@@ -217,7 +222,7 @@ def groups_of(scene: RenderScene, frame: Frame) -> list[Group]:
 
 @contextmanager
 def result_of_start(scene: Scene) -> Iterator[tuple[Result, tuple[Arrow, ...]]]:
-    """Yield the start of a scene as a result, in a directory that is removed afterwards, and what moves in it.
+    """Yield the start of a scene as a result, in a directory that is removed afterwards, its velocities and its loads.
 
     Of each emitter the first layer is there. Raises InputError as `sample_bodies` does.
     """
@@ -256,8 +261,35 @@ def result_of_start(scene: Scene) -> Iterator[tuple[Result, tuple[Arrow, ...]]]:
         store = SegmentStore(Path(directory), header.stored, colliders=scene.colliders)
         store.write(frame, row)
         store.finish()
-        moving = [(place, velocity) for place, velocity in arrows if velocity.any()]
-        yield open_result(directory), tuple((tuple(x.tolist()), tuple(v.tolist())) for x, v in moving)
+        loads = _arrows(_loads(scene, found), "N/m" if d == 2 else "N")
+        yield open_result(directory), (*_arrows(arrows, "m/s"), *loads)
+
+
+def _arrows(vectors: Iterable[tuple[np.ndarray, np.ndarray]], unit: str) -> Iterator[Arrow]:
+    """Yield the arrows of vectors of one kind, (d,), at some places, (d,), m, without those that are zero."""
+    sized = [(place, vector, float(np.linalg.norm(vector))) for place, vector in vectors]
+    longest = max((size for _, _, size in sized), default=0.0)
+    for place, vector, size in sized:
+        if size > 0.0:
+            yield tuple(place.tolist()), tuple((vector / longest).tolist()), f"{size:.3g} {unit}"
+
+
+def _loads(scene: Scene, found: Sequence[BodyParticles]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield where each force on a body acts, (d,), m, and its resultant, (d,), N: the largest at LOAD_TIMES times."""
+    loaded = {one.name: (one.position, one.mass) for one in found if not one.waits}
+    loaded |= {one.name: (one.motion.pose(0.0)[0][None], one.moments.mass) for one in scene.colliders if one.free}
+    for force in scene.forces:
+        if force.body in loaded:
+            position, mass = loaded[force.body]
+            places = dict(zip((*POSITION[: scene.dimension], *INITIAL), [*position.T] * 2, strict=False))
+            forces = (
+                mass * np.stack([value_of(a, t=t, **places) + 0.0 * position[:, 0] for a in force.acceleration], axis=1)
+                for t in np.linspace(0.0, scene.time.end, LOAD_TIMES)
+            )
+            largest = max(forces, key=lambda each: np.linalg.norm(each.sum(axis=0)))
+            sizes, total = np.linalg.norm(largest, axis=1), largest.sum(axis=0)
+            if np.linalg.norm(total) > COHERENT * sizes.sum():
+                yield sizes @ position / sizes.sum(), total
 
 
 def _motion_of(collider: Collider, d: int) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -59,7 +59,7 @@ class Request:
     save_surface: Path | None = None
     colliders: Colliders = "auto"
     overwrite: bool = False
-    arrows: tuple[Arrow, ...] = ()
+    arrows: tuple[Arrow, ...] | None = None
 
     @property
     def rate(self) -> float:

@@ -11,8 +11,8 @@ Mode = Literal["dots", "surface", "fluid", "density"]
 MODES: tuple[Mode, ...] = ("dots", "surface", "fluid", "density")
 Colliders = Literal["auto", "solid", "clear", "none"]
 COLLIDERS: tuple[Colliders, ...] = ("auto", "solid", "clear", "none")
-# A place, m, and a velocity there, m/s; each (d,).
-Arrow = tuple[tuple[float, ...], tuple[float, ...]]
+# A place, m, a vector there relative to the longest of its kind, each (d,), and its magnitude with the unit.
+Arrow = tuple[tuple[float, ...], tuple[float, ...], str]
 ThemeName = Literal["light", "dark"]
 # Pixels along a side, and in all: more would not fit into the memory of a renderer.
 SIDE_MIN, SIDE_MAX = 64, 16_384
@@ -38,7 +38,7 @@ class Settings:
     grid: tuple[int, int] = (1, 1)  # columns and rows of a montage, (1, 1) for a picture of one frame
     # "clear": in 3D only their far sides are drawn, as those of containers are; "auto": hollow ones are cut open.
     colliders: Colliders = "auto"
-    arrows: tuple[Arrow, ...] = ()
+    arrows: tuple[Arrow, ...] | None = None  # of the start of a scene, whose held parts are shown; None for a result
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,7 @@ from mpmcli.scene.problem import (
     path_text,
     problems_of,
     quoted,
+    several,
     value_at,
 )
 from mpmcli.scene.quantity import dimension_of
@@ -80,7 +81,7 @@ class LoadedScene:
 
     Attributes:
         scene: the scene, with no "auto" left in its materials.
-        notes: one sentence for every choice, each beginning with the name of its body.
+        notes: one sentence for every choice, each beginning with the names of its bodies.
         source: the file it came from, as it was given.
     """
 
@@ -134,7 +135,9 @@ def parse_scene(
     # Set the "auto" parameters of every material from the speeds and pressures that can reach its body.
     scene = _with_accelerations(scene)
     whole = scene_bounds(scene)
-    resolved, notes = {}, []
+    resolved: dict[str, tuple] = {}
+    # The names of bodies by the sentence.
+    notes: dict[str, list[str]] = {}
     for table in ("bodies", "emitters"):
         found = []
         for i, body in enumerate(getattr(scene, table)):
@@ -145,9 +148,11 @@ def parse_scene(
             if table == "bodies":
                 changes["particles_per_cell"] = points_per_cell(body, scene.domain.spacing)
             found.append(body.model_copy(update=changes))
-            notes += [f"{body.name}: {sentence}" for sentence in (*knobs.get((table, i), []), *sentences)]
+            for sentence in (*knobs.get((table, i), []), *sentences):
+                notes.setdefault(sentence, []).append(body.name)
         resolved[table] = tuple(found)
-    return LoadedScene(scene.model_copy(update=resolved), tuple(notes), source)
+    told = tuple(f"{several(names)}: {sentence}" for sentence, names in notes.items())
+    return LoadedScene(scene.model_copy(update=resolved), told, source)
 
 
 def scene_problems(data: dict[str, Any], laws: Laws, directory: str | PathLike[str] = ".") -> list[Problem]:

@@ -96,6 +96,11 @@ def listed(words: list[str], last: str = "or") -> str:
     return f" {last} ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
 
 
+def several(words: list[str], most: int = 5) -> str:
+    """Write the first words, and how many more there are: `a, b and 3 more`."""
+    return listed([*words[:most], f"{len(words) - most} more"] if len(words) > most else words, "and")
+
+
 def quoted(words: list[str]) -> list[str]:
     """Write each word as text in TOML."""
     return [f'"{word}"' for word in words]

@@ -13,6 +13,7 @@ import tomli_w
 from mpmcli.errors import InputError
 from mpmcli.scene.examples import examples
 from mpmcli.scene.problem import Path, hint_at, listed, nearest_entry, path_text, written
+from mpmcli.scene.quantity import dimension_of
 from mpmcli.scene.schema import Scene
 
 # Lists and tables within one another. No scene needs a fifth of it, and Python's own stack ends at some hundreds.
@@ -217,6 +218,8 @@ class _Scanner:
 _PATH = re.compile(r"[^.\[\]]+(?:\[\d+\])*(?:\.[^.\[\]]+(?:\[\d+\])*)*")
 _PART = re.compile(r"\[(\d+)\]|([^.\[\]]+)")
 _BARE_WORD = re.compile(r"[^\W\d][\w ./+-]*")
+# Keys whose default is zero along each axis: one entry can be set alone.
+_ZEROS = ("velocity", "gravity", "origin")
 
 
 def apply_overrides(data: dict[str, Any], overrides: Sequence[str]) -> tuple[dict[str, Any], dict[Path, str]]:
@@ -271,7 +274,8 @@ def _value_of(text: str) -> object:
 def set_value(data: dict[str, Any], parts: list[str], value: object) -> Path:
     """Set one value of parsed TOML in place, with the tables on the way to it, and return its path.
 
-    `parts` is what `key_parts` returns. Raises InputError, a sentence without a place, where they lead nowhere.
+    `parts` is what `key_parts` returns. A vector of _ZEROS that is not there begins as zeros. Raises InputError, a
+    sentence without a place, where they lead nowhere.
     """
     at: Any = data
     path: Path = ()
@@ -292,6 +296,8 @@ def set_value(data: dict[str, Any], parts: list[str], value: object) -> Path:
             # A preset that was written as one word becomes a table, so that something can be added to it.
             at[key] = {"preset": at[key]}
             at = at[key]
+        elif isinstance(at, dict) and part in _ZEROS and parts[position + 1].isdecimal():
+            at = at.setdefault(part, [0.0] * (dimension_of(data) or 2))
         elif isinstance(at, dict):
             at = at.setdefault(part, {})
         else:

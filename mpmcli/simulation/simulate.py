@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 
-from mpmcli.check.finding import Finding, passes
+from mpmcli.check.finding import Finding, merged, passes
 from mpmcli.check.scene_check import check_scene
 from mpmcli.errors import DiskFullError, InputError, MpmcliError, RunError
 from mpmcli.frames.ledger import LedgerRow
@@ -84,7 +84,7 @@ def simulate(
                 )
             if earlier is None:
                 taken.clear()
-        notes = (*loaded.notes, *(finding.line for finding in findings if finding.severity != "note"))
+        notes = (*loaded.notes, *(one.line for one in merged(findings) if one.severity != "note"))
         context = RunContext(loaded, settings, plan, backend, earlier, notes, began, taken, check)
         if run is None:
             return _complete(context, on_start, stop)

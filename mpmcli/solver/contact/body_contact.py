@@ -45,6 +45,8 @@ FAR_ASIDE = 3.0
 LARGEST, SMALLEST = 80.0, 1e-37
 # The gap of bodies of which one shows no surface, cells: they do not meet.
 APART = 9.0
+# Threads of a GPU that work at nodes of all runs, as each needs memory for surface points, and the fewest of a run.
+GPU_THREADS, LEAST_THREADS = 4096, 64
 # Numbers of a layer: P-wave modulus, Pa, sharpness, 1/m, factor of a sum over a flat surface, distance of particles, m,
 # density, kg/m^3, and from FRICTION on the coefficient of friction with each layer, `STICKS` for one that sticks.
 MODULUS, SHARPNESS, FLAT, DISTANCE, DENSITY, FRICTION = range(6)
@@ -58,7 +60,7 @@ class BodyContact:
 
     Attributes:
         surfaces: what they show; layers: of each run; capacity: surface points near a node, of each body.
-        rows: of each layer of each run its numbers, see MODULUS.
+        rows: of each layer of each run its numbers, see MODULUS; threads: of a run on a GPU.
         loads: what the first layer of each pair takes from the second, about the lower corner, see `Layers.pairs`.
         extremes: of each run since the last frame the deepest overlap and the largest gap that acted, cells.
         points: of each thread and of two bodies, row by row, of surface points near a node the way to it, m, by how
@@ -74,16 +76,24 @@ class BodyContact:
         layers: Layers,
         runs: int,
         threads: int,
+        *,
+        on_cpu: bool,
     ) -> None:
-        self.surfaces = BodySurfaces(groups, orders, grid, layers, runs)
+        self.surfaces = BodySurfaces(groups, orders, grid, layers, runs, on_cpu=on_cpu)
         self.dimension, self.layers, self.node_count = grid.dimension, layers.count, grid.node_count
-        # Two layers of particles, at four times the density of those at rest.
-        self.capacity = 8 * math.ceil((grid.scheme.spline.nodes * layers.per_axis) ** (grid.dimension - 1))
+        self.capacity = points_near(grid.scheme.spline.nodes, layers, grid.dimension)
         self.rows = ti.field(float, shape=(runs * layers.count, FRICTION + layers.count))
-        self.loads = Loads(max(1, layers.pairs), grid.shape, runs, on_cpu=True)
+        self.pairs, self.loads = layers.pairs, Loads(max(1, layers.pairs), grid.shape, runs, on_cpu=on_cpu)
         self.extremes = ti.field(float, shape=(runs, len(EXTREMES)))
         self.share = (2 * grid.dimension + 2) * self.capacity
-        self.points = ti.field(float, shape=2 * max(runs, threads) * self.share + LANES)
+        self.threads = max(LEAST_THREADS, GPU_THREADS // runs)
+        at_once = max(runs, threads) if on_cpu else runs * self.threads
+        self.points = ti.field(float, shape=2 * at_once * self.share + LANES)
+
+    @staticmethod
+    def gpu_bytes(stencil: int, layers: Layers, dimension: int, real: int) -> int:
+        """Return the bytes of surface points on a GPU, for stencils of so many nodes per axis."""
+        return 2 * GPU_THREADS * (2 * dimension + 2) * points_near(stencil, layers, dimension) * real
 
     def write(self, scene: Scene, run: int = 0) -> None:
         """Set what a run has: its bodies, and the friction between them."""
@@ -100,6 +110,14 @@ class BodyContact:
         for layer, row in enumerate(np.hstack([rows, layers.frictions(scene)])):
             for k, number in enumerate(row):
                 self.rows[run * self.layers + layer, k] = number
+
+    def read(self, run: int) -> dict[str, np.ndarray]:
+        """Return the loads and the extremes of a run since the last frame, on a GPU, and forget them."""
+        extremes = self.extremes.to_numpy()
+        found = {"contact": self.loads.read(run, self.pairs)} | dict(zip(EXTREMES, extremes[run], strict=True))
+        extremes[run] = 0.0
+        self.extremes.from_numpy(extremes)
+        return found
 
     @ti.func
     def sum_up(self, run: int, frame: int, column: int, frame_stats: ti.template()):
@@ -132,21 +150,36 @@ class BodyContact:
             node = grid.row_start(row)
             index = grid.linear_index(node)
             for _ in range(grid.row_length(node)):
-                place = self.surfaces.place_of(grid, w, index)
-                present = self.surfaces.present[place]
-                # Layers in descending order: pairs of them, then each and the obstacles, whose numbers follow theirs.
-                for turn in range(ti.select(self.surfaces.met[place] > 1, 2, 1)):
-                    rest = present
-                    while rest > 255 or (turn == 1 and rest > ti.static(int(self.surfaces.shares))):
-                        c, others, o = ti.cast(rest & 255, int) - 1, rest >> 8, 0
-                        while (turn == 0 and others > 0) or (turn == 1 and o < obstacles.count()):
-                            a = ti.select(turn == 0, ti.cast(others & 255, int) - 1, c)
-                            met = ti.select(turn == 0, c, self.layers + o)
-                            self.exchange(grid, obstacles, w, thread, node, index, a, met, dt, gravity_step)
-                            others, o = others >> 8, o + 1
-                        rest = rest >> 8
+                self.exchange_all(grid, obstacles, w, thread, node, index, dt, gravity_step)
                 node[last] += 1
                 index += 1
+
+    @ti.func
+    def exchange_all(
+        self,
+        grid: ti.template(),
+        obstacles: ti.template(),
+        w: int,
+        thread: int,
+        node: ti.template(),
+        index: int,
+        dt: float,
+        gravity_step: ti.template(),
+    ):
+        """Let bodies exchange momentum at a node, by its index in layer 0, and then obstacles push them."""
+        place = self.surfaces.place_of(grid, w, index)
+        present = self.surfaces.present[place]
+        # Layers in descending order: pairs of them, then each and the obstacles, whose numbers follow theirs.
+        for turn in range(ti.select(self.surfaces.met[place] > 1, 2, 1)):
+            rest = present
+            while rest > 255 or (turn == 1 and rest > ti.static(int(self.surfaces.shares))):
+                c, others, o = ti.cast(rest & 255, int) - 1, rest >> 8, 0
+                while (turn == 0 and others > 0) or (turn == 1 and o < obstacles.count()):
+                    a = ti.select(turn == 0, ti.cast(others & 255, int) - 1, c)
+                    met = ti.select(turn == 0, c, self.layers + o)
+                    self.exchange(grid, obstacles, w, thread, node, index, a, met, dt, gravity_step)
+                    others, o = others >> 8, o + 1
+                rest = rest >> 8
 
     @ti.func
     def exchange(
@@ -364,9 +397,10 @@ class BodyContact:
                             depth = self.surfaces.surface[g][p][d]
                             near = depth < self.rows[w * self.layers + layer, DISTANCE]
                             if near and counts[side] < self.capacity:
-                                way -= depth * n
                                 at = (2 * thread + side) * self.share + counts[side]
                                 for b in ti.static(range(d)):
+                                    # Entry by entry: Taichi may lose vectors that are assigned as a whole.
+                                    way[b] -= depth * n[b]
                                     self.points[at + b * self.capacity] = outwards * way[b]
                                     self.points[at + ti.static(d + 1 + b) * self.capacity] = outwards * n[b]
                                 self.points[at + d * self.capacity] = way.norm_sqr() / (2.0 * BALL * h)
@@ -451,6 +485,11 @@ class BodyContact:
         for k in ti.static(range(points.n)):
             for lane in range(LANES):
                 points[k, lane] = self.points[first + k * self.capacity + lane]
+
+
+def points_near(stencil: int, layers: Layers, dimension: int) -> int:
+    """Return how many surface points of a body may be near a node: two layers, at four times the density at rest."""
+    return 8 * math.ceil((stencil * layers.per_axis) ** (dimension - 1))
 
 
 @ti.func

@@ -79,7 +79,8 @@ def require_contact_possible(scene: Scene, backend: Backend) -> None:
     """
     layers = Layers.of(scene)
     reasons = {
-        f"with --arch {backend.arch}": not backend.on_cpu,
+        f"with --arch {backend.arch}": not backend.doubles,
+        "with solver.deterministic = true on a GPU": scene.solver.deterministic and not backend.on_cpu,
         'with solver.solids = "total"': scene.solver.solids == "total",
         "on a sparse grid": wants_sparse(scene),
         "in a domain with periodic walls": any(PERIODIC in pair for pair in scene.domain.walls.faces(scene.dimension)),

@@ -210,15 +210,24 @@ class BodySurfaces:
             there, EMPTY, or CLOSED where nothing meets at a node of that stencil; following: of each particle, the
             next one.
         end: of each tile, the particle after the last one that may show something.
+        counted, rank, slots, reserved: on a GPU, of each bin how many it has; of each particle how many its bin had
+            before it; the particles bin by bin; and how many of these a run has.
         shown: of each particle its layer, or HIDDEN; surface: the normal n of its body, the depth d below it, m,
             and dv/dn, 1/s.
     """
 
     def __init__(
-        self, groups: Sequence[ParticleArrays], orders: Sequence[TileOrder], grid: Grid, layers: Layers, runs: int
+        self,
+        groups: Sequence[ParticleArrays],
+        orders: Sequence[TileOrder],
+        grid: Grid,
+        layers: Layers,
+        runs: int,
+        *,
+        on_cpu: bool,
     ) -> None:
         d = self.dimension = grid.dimension
-        self.layers, self.shares = layers.count, layers.shares
+        self.layers, self.shares, self.runs = layers.count, layers.shares, runs
         self.groups, self.orders = tuple(groups), tuple(orders)
         self.surfaced = tuple(g for g, group in enumerate(groups) if group.surfaced)
         self.node_count, count = grid.node_count, runs * layers.count
@@ -235,11 +244,17 @@ class BodySurfaces:
             self.following[g], self.shown[g] = ti.field(int, shape=room), ti.field(int, shape=room)
             self.end[g] = ti.field(int, shape=orders[g].start.shape)
             self.surface[g] = ti.Vector.field(2 * d + 1, float, shape=room)
+        self.counted, self.rank, self.slots, self.reserved = {}, {}, {}, {}
+        for g in () if on_cpu else self.surfaced:
+            self.counted[g] = ti.field(int, shape=runs * grid.node_count)
+            self.rank[g], self.slots[g] = (ti.field(int, shape=groups[g].capacity) for _ in range(2))
+            self.reserved[g] = ti.field(int, shape=runs)
 
     @staticmethod
-    def bytes_needed(nodes: int, tiles: int, particles: Sequence[int], surface: int) -> int:
+    def bytes_needed(nodes: int, tiles: int, particles: Sequence[int], surface: int, *, on_cpu: bool) -> int:
         """Return the bytes for so many nodes, tiles, and particles per group of which each shows so many bytes."""
-        return nodes * 12 + (nodes + tiles) * 4 * len(particles) + sum(particles) * (8 + surface)
+        own = nodes * 12 + (nodes + tiles) * 4 * len(particles) + sum(particles) * (8 + surface)
+        return own if on_cpu else own + 4 * nodes * len(particles) + 8 * sum(particles)
 
     # Where bodies may meet.
 
@@ -254,8 +269,11 @@ class BodySurfaces:
     def widen(self, layer: int, base: ti.template()):
         """Let the range of a layer, counted over all runs, include a stencil."""
         for a in ti.static(range(self.dimension)):
-            self.low[layer][a] = ti.min(self.low[layer][a], base[a])
-            self.high[layer][a] = ti.max(self.high[layer][a], base[a])
+            # The comparisons may be late, and save most atomics of a GPU.
+            if base[a] < self.low[layer][a]:
+                ti.atomic_min(self.low[layer][a], base[a])
+            if base[a] > self.high[layer][a]:
+                ti.atomic_max(self.high[layer][a], base[a])
 
     @ti.func
     def find_box(self, grid: ti.template(), obstacles: ti.template(), w: int, drift: int, last: ti.template()):
@@ -265,6 +283,8 @@ class BodySurfaces:
         """
         d, reach, begin = ti.static((self.dimension, grid.scheme.spline.nodes - 1, w * self.layers))
         self.drift[w] = drift
+        for g in ti.static(tuple(self.reserved)):
+            self.reserved[g][w] = 0
         for layer in range(begin, begin + self.count[w]):
             stay_rolled(self.orders[0].buffers.real, layer)
             for a in ti.static(range(d)):
@@ -317,9 +337,16 @@ class BodySurfaces:
             place = self.place_of(grid, w, grid.linear_index(node))
             for k in range(grid.row_length(node)):
                 stay_rolled(self.orders[0].buffers.real, place + k)
-                self.present[place + k] = 0
-                for g in ti.static(self.surfaced):
-                    self.first[g][place + k] = CLOSED
+                self.clear(place + k)
+
+    @ti.func
+    def clear(self, place: int):
+        """Forget who is present at a node."""
+        self.present[place] = 0
+        for g in ti.static(self.surfaced):
+            self.first[g][place] = CLOSED
+            if ti.static(len(self.counted) > 0):
+                self.counted[g][place] = 0
 
     @ti.func
     def find_rows(self, grid: ti.template(), obstacles: ti.template(), w: int, first: int, after: int):
@@ -354,14 +381,41 @@ class BodySurfaces:
                         cells = obstacles.nearest(place_of(node, grid.spacing), REACH) * grid.inverse_spacing
                         met += 2 * ti.cast(cells < REACH, int)
                         far = node[last] + ti.cast(ti.min(ti.max(cells - REACH, 0.0), 1e6), int)
-                self.met[place + k] = met
-                if met > 0:
-                    for q in range(ti.static(grid.scheme.spline.nodes**self.dimension)):
-                        before, inside = self.stencil_before(grid, node, q)
-                        if inside:
-                            for g in ti.static(self.surfaced):
-                                self.first[g][place + k - before] = EMPTY
+                self.meet(grid, node, place + k, met)
                 node[last] += 1
+
+    @ti.func
+    def meet(self, grid: ti.template(), node: ti.template(), place: int, met: int):
+        """Store what meets at a node, see `met`, and open the bins of the stencils that hold it."""
+        self.met[place] = met
+        if met > 0:
+            for q in range(ti.static(grid.scheme.spline.nodes**self.dimension)):
+                before, inside = self.stencil_before(grid, node, q)
+                if inside:
+                    for g in ti.static(self.surfaced):
+                        self.first[g][place - before] = EMPTY
+
+    @ti.func
+    def find(self, grid: ti.template(), obstacles: ti.template(), w: int, node: ti.template()):
+        """Do for one node what `find_rows` does for rows."""
+        index = grid.linear_index(node)
+        place = self.place_of(grid, w, index)
+        present = ti.cast(0, ti.i64)
+        for layer in range(self.count[w]):
+            used, inside = 2 * (w * self.layers + layer), True
+            for a in ti.static(range(self.dimension)):
+                beyond = node[a] - self.used[used, a]
+                inside = inside and beyond >= 0 and beyond < self.used[used + 1, a]
+            if inside:
+                if grid.nodes[index + layer * ti.static(self.node_count)][self.dimension] > 0.0:
+                    present = 256 * present + layer + 1
+        self.present[place] = present
+        bodies = self.bodies_at(place)
+        met = ti.cast(bodies > 1, int)
+        if ti.static(obstacles.any):
+            if bodies > 0:
+                met += 2 * ti.cast(obstacles.nearest(place_of(node, grid.spacing), REACH) < REACH * grid.spacing, int)
+        self.meet(grid, node, place, met)
 
     @ti.func
     def opens(self, g: ti.template(), grid: ti.template(), w: int, low: ti.template(), high: ti.template()):
@@ -455,7 +509,6 @@ class BodySurfaces:
     @ti.func
     def show(self, g: ti.template(), grid: ti.template(), w: int, q: int):
         """Find what the particles of the g-th group in the q-th tile show."""
-        d, group = ti.static((self.dimension, self.groups[g]))
         tile, place = self.tile_at(grid, self.orders[g], w, q)
         begin, end = self.orders[g].start[tile], self.orders[g].start[tile + 1]
         if begin < end:
@@ -464,28 +517,34 @@ class BodySurfaces:
                 end = begin
         self.end[g][tile] = end
         for p in range(begin, self.end[g][tile]):
-            base, _ = grid.scheme.spline.stencil(group.x[p], grid.inverse_spacing)
-            shown = HIDDEN
-            # What lies deeper at rest is farther from the surface than the band, unless it is crushed.
-            if group.carried[p][d] < CRUSHED * BAND * grid.spacing:
-                bin_ = self.bin_of(grid, w, base)
-                if bin_ >= 0 and self.first[g][ti.max(bin_, 0)] != CLOSED:
-                    N = ti.Vector.zero(float, d)
+            self.show_particle(g, grid, w, p)
+
+    @ti.func
+    def show_particle(self, g: ti.template(), grid: ti.template(), w: int, p: int):
+        """Find what a particle of the g-th group shows."""
+        d, group = ti.static((self.dimension, self.groups[g]))
+        base, _ = grid.scheme.spline.stencil(group.x[p], grid.inverse_spacing)
+        shown = HIDDEN
+        # What lies deeper at rest is farther from the surface than the band, unless it is crushed.
+        if group.carried[p][d] < CRUSHED * BAND * grid.spacing:
+            bin_ = self.bin_of(grid, w, base)
+            if bin_ >= 0 and self.first[g][ti.max(bin_, 0)] != CLOSED:
+                N = ti.Vector.zero(float, d)
+                for c in ti.static(range(d)):
+                    N[c] = group.carried[p][c]
+                n = group.stored(p).inverse().transpose() @ N
+                size = n.norm()
+                depth = group.carried[p][d] / size
+                if depth < BAND * grid.spacing:
+                    shown = group.layer_of(p)
                     for c in ti.static(range(d)):
-                        N[c] = group.carried[p][c]
-                    n = group.stored(p).inverse().transpose() @ N
-                    size = n.norm()
-                    depth = group.carried[p][d] / size
-                    if depth < BAND * grid.spacing:
-                        shown = group.layer_of(p)
-                        for c in ti.static(range(d)):
-                            self.surface[g][p][c] = n[c] / size
-                            slope = 0.0
-                            for a in ti.static(range(d)):
-                                slope += group.gradient[p][a, c] * n[a] / size
-                            self.surface[g][p][d + 1 + c] = slope
-                        self.surface[g][p][d] = depth
-            self.shown[g][p] = shown
+                        self.surface[g][p][c] = n[c] / size
+                        slope = 0.0
+                        for a in ti.static(range(d)):
+                            slope += group.gradient[p][a, c] * n[a] / size
+                        self.surface[g][p][d + 1 + c] = slope
+                    self.surface[g][p][d] = depth
+        self.shown[g][p] = shown
 
     @ti.func
     def link(self, g: ti.template(), grid: ti.template(), w: int, q: int):
@@ -498,3 +557,46 @@ class BodySurfaces:
                 place = self.bin_of(grid, w, base)
                 self.following[g][p] = self.first[g][place]
                 self.first[g][place] = p
+
+    # On a GPU, where every node or particle has a thread: particles are counted bin by bin, bins reserve their places,
+    # particles take these, and the places of each bin become its list.
+
+    @ti.func
+    def bin_at(self, g: ti.template(), grid: ti.template(), w: int, p: int):
+        """Return the bin of a particle of the g-th group."""
+        base, _ = grid.scheme.spline.stencil(self.groups[g].x[p], grid.inverse_spacing)
+        return self.bin_of(grid, w, base)
+
+    @ti.func
+    def count_particle(self, g: ti.template(), grid: ti.template(), w: int, p: int):
+        """Find what a particle of the g-th group shows, and count it."""
+        self.show_particle(g, grid, w, p)
+        if self.shown[g][p] != HIDDEN:
+            self.rank[g][p] = ti.atomic_add(self.counted[g][self.bin_at(g, grid, w, p)], 1)
+
+    @ti.func
+    def reserve(self, w: int, place: int):
+        """Reserve places for the bins of a node."""
+        for g in ti.static(self.surfaced):
+            if self.counted[g][place] > 0:
+                begin = w * ti.static(self.groups[g].capacity // self.runs)
+                self.first[g][place] = begin + ti.atomic_add(self.reserved[g][w], self.counted[g][place])
+
+    @ti.func
+    def put(self, g: ti.template(), grid: ti.template(), w: int, p: int):
+        """Put a particle of the g-th group into its place."""
+        if self.shown[g][p] != HIDDEN:
+            self.slots[g][self.first[g][self.bin_at(g, grid, w, p)] + self.rank[g][p]] = p
+
+    @ti.func
+    def chain(self, _w: int, place: int):
+        """Make lists of the places of the bins of a node."""
+        for g in ti.static(self.surfaced):
+            if self.counted[g][place] > 0:
+                begin, end = self.first[g][place], self.first[g][place] + self.counted[g][place]
+                self.first[g][place] = self.slots[g][begin]
+                for k in range(begin, end):
+                    following = EMPTY
+                    if k + 1 < end:
+                        following = self.slots[g][k + 1]
+                    self.following[g][self.slots[g][k]] = following

@@ -85,7 +85,7 @@ class Batch:
                 f"colliders that move need double precision, which --arch {backend.arch} lacks; give --arch cpu"
             )
         # Many small runs on a GPU are in its cache, and use all nodes of their domains.
-        sorts = on_cpu or runs == 1 or kind.inflow.any
+        sorts = on_cpu or runs == 1 or kind.inflow.any or kind.layers.separate
         scheme = scheme_of(kind.settings, keeps_flip_velocity=kind.keeps_motion)
         averaged = [averages_volume(kind.settings, law) for law in kind.members]
         period = Period(kind.faces, runs, at_once=not on_cpu)
@@ -129,7 +129,9 @@ class Batch:
         self._buffers = SortBuffers(groups, runs) if sorts else None
         orders = self._make_orders(groups, grid) if sorts else []
         contact = contact_between(groups, kind.bodies, grid, backend, runs)
-        colliders = motion = rigid = None
+        colliders = motion = rigid = surfaces = None
+        if kind.layers.separate:
+            surfaces = BodyContact(groups, orders, grid, kind.layers, runs, backend.threads, on_cpu=on_cpu)
         if kind.colliders.count:
             colliders = Colliders(kind.colliders, d, grid.shape, PAD, runs, on_cpu=on_cpu, deterministic=deterministic)
             colliders.layered, colliders.own = kind.layers.separate, int(not kind.layers.shares)
@@ -157,7 +159,7 @@ class Batch:
             rigid,
             RigidContact(rigid, kind.faces, runs) if rigid else None,
             Emission(kind.inflow, d, runs) if kind.inflow.groups else None,
-            BodyContact(groups, orders, grid, kind.layers, runs, backend.threads) if kind.layers.separate else None,
+            surfaces,
             ti.field(int, shape=(2 * runs, d)) if on_cpu else None,
             sorts,
             self._drift_allowed(grid, contact is not None),

@@ -13,7 +13,6 @@ from mpmcli.boundaries.loads import Loads
 from mpmcli.boundaries.rigid_bodies import RigidBodies
 from mpmcli.quick_taichi import ti
 from mpmcli.solver.contact.body_contact import BodyContact
-from mpmcli.solver.contact.surfaces import Obstacles
 from mpmcli.solver.engine.cpu_phases import CpuPhases, FrameBuffer, RunInts, RunReals
 from mpmcli.solver.engine.cpu_threads import LOOKS_IN_VAIN, CpuThreads
 from mpmcli.solver.engine.device import Device
@@ -159,8 +158,6 @@ class CpuLaunch:
         """Prepare the step that was chosen."""
         self.find_box(run)
         self.phases.begin_step(run)
-        if ti.static(self.phases.separates):
-            self.find_meetings(run)
 
     @ti.func
     def measure(self, run: ti.template()):
@@ -231,14 +228,6 @@ class CpuLaunch:
             self.device.grid.box[run.w * 2 + 1, a] = last - first + 1
         if ti.static(self.phases.shared and not self.device.grid.sparse):
             self.phases.places.divide_rows()
-
-    @ti.func
-    def find_meetings(self, run: ti.template()):
-        """Find where bodies may meet in the step, with colliders where they are in it."""
-        drift = ti.cast(ti.ceil(run.drift), int)
-        (view,) = ti.static(self.phases.see(run))
-        (obstacles,) = ti.static((Obstacles(view.nodes.images.walls, view.nodes.colliders, view.grid.spacing),))
-        self.device.contact.surfaces.find_box(self.device.grid, obstacles, run.w, drift, view.particles.last)
 
     @ti.func
     def enter(self, run: ti.template()):

@@ -8,13 +8,11 @@ asks for the numbers of the run anew.
 """
 
 from collections.abc import Callable
-from copy import copy
 from typing import NamedTuple
 
 from mpmcli.boundaries.mirror_images import find_friction
 from mpmcli.quick_taichi import ti
-from mpmcli.solver.contact.surfaces import Obstacles
-from mpmcli.solver.engine.device import Device, RunPhases, RunView
+from mpmcli.solver.engine.device import Device, RunPhases, RunView, Work
 from mpmcli.solver.engine.run_state import Layout
 from mpmcli.solver.engine.step import Phase, sorted_fields
 from mpmcli.solver.frames.reader import show_range
@@ -57,34 +55,18 @@ class PartKind(NamedTuple):
     item: Callable | None
 
 
-class Part:
-    """A part that a thread does, with the view that its run has of the device.
+class Part(Work):
+    """A part that a thread does; atomic: whether sums need atomics, False.
 
-    Attributes:
-        run, step, grid, nodes, particles, order, group: see `RunView`; the last two are those of a group of particles.
-        item: what is done for each node or particle; atomic: whether sums need atomics, False.
-        g: number of the group; w: of the run; turn: of the phase among those of its kind.
-        region, part: of the part; t: of the thread; frame_buffer: see `Batch`.
+    region, part: of the part; t: of the thread; frame_buffer: see `Batch`.
     """
 
     atomic = False
 
-    def __init__(self, view: RunView, kind: PartKind, *variables: object) -> None:
+    def __init__(self, view: RunView, kind: PartKind, turn: object, *variables: object) -> None:
         """Keep a view, and variables of a kernel."""
-        g, self.item = kind.group, kind.item
-        self.run, self.step, self.w = view.run, view.step, view.w
-        self.grid, self.nodes, self.particles = view.grid, view.nodes, view.particles
-        self.g, self.group, self.order = g, view.groups[g], view.orders[g]
-        self.turn, self.region, self.part, self.t, self.frame_buffer = variables
-
-    def in_layer(self, layer: object, own: object) -> "Part":
-        """Return the part for a layer of nodes, by its number and what it has in use, variables of a kernel."""
-        if self.grid.layers == 1:
-            return self
-        view = copy(self)
-        view.grid = self.grid.in_layer(layer, own)
-        view.nodes = self.nodes.in_layer(view.grid, layer)
-        return view
+        super().__init__(view, kind.group, kind.item, turn)
+        self.region, self.part, self.t, self.frame_buffer = variables
 
 
 @ti.data_oriented
@@ -216,7 +198,6 @@ class CpuPhases(RunPhases):
         self.regions = device.threads if self.shared else 1
         self.places = CpuRegions(device, self.regions)
         self.colours = device.orders[0].colours
-        self.separates = device.contact is not None
         # What has come in since the sort follows all colours, on one thread.
         self.passes = self.colours + device.comes_and_goes
         self.kinds: tuple[PartKind, ...] = ()
@@ -542,31 +523,6 @@ class CpuPhases(RunPhases):
     # Bodies with velocity fields of their own, see `contact.body_contact`.
 
     @ti.func
-    def layer_count(self, at: ti.template()):
-        """Return the number of layers: one that compilers do not know, as they would repeat what is done for each."""
-        count = 1
-        if ti.static(self.separates):
-            count = self.device.contact.surfaces.count[at.w]
-        return count
-
-    @ti.func
-    def used_by(self, at: ti.template(), layer: int):
-        """Return what a layer has in use, as `Grid.box`."""
-        own = ti.Matrix.zero(int, 2, self.dimension)
-        if ti.static(self.separates):
-            for i, a in ti.static(ti.ndrange(2, self.dimension)):
-                own[i, a] = self.device.contact.surfaces.used[(at.w * ti.static(at.grid.layers) + layer) * 2 + i, a]
-        return own
-
-    @ti.func
-    def near_bodies(self, at: ti.template()):
-        """Return the box of the nodes where bodies may meet, as `Grid.box`."""
-        box = ti.Matrix.zero(int, 2, self.dimension)
-        for i, a in ti.static(ti.ndrange(2, self.dimension)):
-            box[i, a] = self.device.contact.surfaces.box[at.w * 2 + i, a]
-        return box
-
-    @ti.func
     def rows_near_bodies(self, grid: ti.template(), at: ti.template()):
         """Return the first of a part of the rows of nodes where bodies may meet, and the one after the last."""
         first, after = self.places.even_part(grid.row_count(), at.region)
@@ -576,7 +532,7 @@ class CpuPhases(RunPhases):
     def find_bodies(self, at: ti.template()):
         """Find where two bodies meet."""
         box = self.near_bodies(at)
-        grid, obstacles = ti.static((at.grid.within(box), obstacles_of(at)))
+        grid, obstacles = ti.static((at.grid.within(box), at.obstacles()))
         first, after = self.rows_near_bodies(grid, at)
         self.device.contact.surfaces.find_rows(grid, obstacles, at.w, first, after)
 
@@ -604,7 +560,7 @@ class CpuPhases(RunPhases):
     def exchange(self, at: ti.template()):
         """Let bodies that meet at nodes exchange momentum, and walls and colliders push them."""
         box, gravity_step = self.near_bodies(at), self.gravity_of(at.step)
-        grid, obstacles = ti.static((at.grid.within(box), obstacles_of(at)))
+        grid, obstacles = ti.static((at.grid.within(box), at.obstacles()))
         first, after = self.rows_near_bodies(grid, at)
         thread = at.w * ti.static(self.regions) + at.t
         self.device.contact.exchange_rows(grid, obstacles, at.w, thread, first, after, at.step.dt, gravity_step)
@@ -673,8 +629,3 @@ class CpuPhases(RunPhases):
             scratch.real,
             offset,
         )
-
-
-def obstacles_of(at: Part) -> Obstacles:
-    """Return the walls and colliders of the run of a part."""
-    return Obstacles(at.nodes.images.walls, at.nodes.colliders, at.grid.spacing)

@@ -1,6 +1,6 @@
 """What a batch has on the device, and the view of it that one run has in the kernel."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass
 
@@ -12,6 +12,7 @@ from mpmcli.boundaries.rigid_contact import RigidContact
 from mpmcli.boundaries.walls import MovingFaces, RoughFaces, Walls
 from mpmcli.quick_taichi import ti
 from mpmcli.solver.contact.body_contact import BodyContact
+from mpmcli.solver.contact.surfaces import Obstacles
 from mpmcli.solver.drive.forces import DriveValues, Gravity
 from mpmcli.solver.engine.run_state import Layout, RunState, StepState
 from mpmcli.solver.engine.step import Phase, step_phases
@@ -84,6 +85,7 @@ class Device:
             loads=self.grid.deterministic and self.nodes.collides,
             shifts=self.grid.dimension if self.grid.fine else 0,
             separates=self.contact is not None,
+            serial=self.stencils is not None,
             rigid=self.rigid is not None,
         )
 
@@ -165,6 +167,34 @@ class RunView:
         )
 
 
+class Work:
+    """What a thread does for a phase, with the view that its run has of the device.
+
+    Attributes:
+        run, step, grid, nodes, particles, order, group: see `RunView`; the last two are those of a group of particles.
+        item: what is done for each node or particle; g: number of the group; w: of the run; turn: of the phase.
+    """
+
+    def __init__(self, view: RunView, g: int, item: Callable | None, turn: object) -> None:
+        self.run, self.step, self.w = view.run, view.step, view.w
+        self.grid, self.nodes, self.particles = view.grid, view.nodes, view.particles
+        self.g, self.group, self.order = g, view.groups[g], view.orders[g] if view.orders else None
+        self.item, self.turn = item, turn
+
+    def in_layer(self, layer: object, own: object) -> "Work":
+        """Return the same for a layer of nodes, by its number and what it has in use, variables of a kernel."""
+        if self.grid.layers == 1:
+            return self
+        view = copy(self)
+        view.grid = self.grid.in_layer(layer, own)
+        view.nodes = self.nodes.in_layer(view.grid, layer)
+        return view
+
+    def obstacles(self) -> Obstacles:
+        """Return the walls and colliders of the run."""
+        return Obstacles(self.nodes.images.walls, self.nodes.colliders, self.grid.spacing)
+
+
 @ti.data_oriented
 class RunPhases:
     """What the bodies of phases need of the runs of a batch on any device.
@@ -172,13 +202,15 @@ class RunPhases:
     Attributes:
         values: the numbers of the step of each run, see `run_state.STEP`.
         members: (number, group) of each law.
-        moves, rigid: whether colliders move, as they are told or freely.
+        moves, rigid: whether colliders move, as they are told or freely; separates: whether bodies have velocity fields
+            of their own, see `contact.body_contact`.
     """
 
     def __init__(self, device: Device, layout: Layout) -> None:
         self.device, self.layout, self.dimension = device, layout, device.grid.dimension
         self.members = tuple(enumerate(device.groups))
         self.moves, self.rigid = device.motion is not None, device.rigid is not None
+        self.separates = device.contact is not None
         self.values = ti.field(float, shape=(device.runs, layout.widths["step"]))
 
     def state(self, w: object, numbers: object, counts: object) -> RunState:
@@ -214,6 +246,41 @@ class RunPhases:
         if ti.static(self.rigid):
             self.device.rigid.begin(run.w, run.dt, step.kick, self.gravity_of(step))
         self.forget_extremes(step)
+        if ti.static(self.separates):
+            self.find_meetings(run)
+
+    @ti.func
+    def find_meetings(self, run: ti.template()):
+        """Find where bodies may meet in a step, with colliders where they are in it."""
+        drift = ti.cast(ti.ceil(run.drift), int)
+        (view,) = ti.static(self.see(run))
+        (obstacles,) = ti.static((Obstacles(view.nodes.images.walls, view.nodes.colliders, view.grid.spacing),))
+        self.device.contact.surfaces.find_box(self.device.grid, obstacles, run.w, drift, view.particles.last)
+
+    @ti.func
+    def layer_count(self, at: ti.template()):
+        """Return the number of layers: one that compilers do not know, as they would repeat what is done for each."""
+        count = 1
+        if ti.static(self.separates):
+            count = self.device.contact.surfaces.count[at.w]
+        return count
+
+    @ti.func
+    def used_by(self, at: ti.template(), layer: int):
+        """Return what a layer has in use, as `Grid.box`."""
+        own = ti.Matrix.zero(int, 2, self.dimension)
+        if ti.static(self.separates):
+            for i, a in ti.static(ti.ndrange(2, self.dimension)):
+                own[i, a] = self.device.contact.surfaces.used[(at.w * ti.static(at.grid.layers) + layer) * 2 + i, a]
+        return own
+
+    @ti.func
+    def near_bodies(self, at: ti.template()):
+        """Return the box of the nodes where bodies may meet, as `Grid.box`."""
+        box = ti.Matrix.zero(int, 2, self.dimension)
+        for i, a in ti.static(ti.ndrange(2, self.dimension)):
+            box[i, a] = self.device.contact.surfaces.box[at.w * 2 + i, a]
+        return box
 
     @ti.func
     def forget_extremes(self, step: ti.template()):

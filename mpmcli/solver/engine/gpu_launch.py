@@ -16,7 +16,7 @@ from mpmcli.boundaries.mirror_images import find_friction
 from mpmcli.boundaries.rigid_bodies import ROUNDS
 from mpmcli.quick_taichi import ti
 from mpmcli.solver.drive.forces import HostValues
-from mpmcli.solver.engine.device import Device, RunPhases, RunView
+from mpmcli.solver.engine.device import Device, RunPhases, RunView, Work
 from mpmcli.solver.engine.emission import GpuEmission
 from mpmcli.solver.engine.run_state import ATTEND, GOING, MEASURE, Layout, RunState
 from mpmcli.solver.engine.step import Phase, sorted_fields
@@ -28,27 +28,21 @@ from mpmcli.solver.particles.sort import SPAN, keep, take
 from mpmcli.solver.particles.state_bounds import NOTHING, deformation_rate, entries, widen_motion, widen_state
 from mpmcli.solver.transfer.cpu_transfers import update_rows
 from mpmcli.solver.transfer.lanes import LANES
-from mpmcli.solver.transfer.particle_update import NOT_LOST
+from mpmcli.solver.transfer.particle_update import NOT_LOST, ParticleUpdate
 from mpmcli.solver.transfer.splines import PAD
 from mpmcli.solver.transfer.volume import add_volume, clear_mean, missing_to_mean
 from mpmcli.stability.transfer_factors import INTERVAL
 
 
-class Item:
-    """A node, a particle, or a row of nodes that a thread works on, with the view that its run has of the device.
-
-    run, step, grid, nodes, particles, order, group: see `RunView`; the last two are those of a group of particles. g:
-    number of the group; w: of the run; turn: of the phase; q: of the item. atomic: whether sums need atomics, True.
-    """
+class Item(Work):
+    """A node, a particle, or a row of nodes, number q, that a thread works on; atomic: whether sums need that, True."""
 
     atomic = True
 
     def __init__(self, view: RunView, phase: Phase, turn: int, q: object) -> None:
         """Keep a view, and a variable of a kernel."""
-        g, self.item, self.turn, self.q = phase.group, phase.body, turn, q
-        self.run, self.step, self.w = view.run, view.step, view.w
-        self.grid, self.nodes, self.particles = view.grid, view.nodes, view.particles
-        self.g, self.group, self.order = g, view.groups[g], view.orders[g] if view.orders else None
+        super().__init__(view, phase.group, phase.body, turn)
+        self.q = q
 
 
 @ti.data_oriented
@@ -84,10 +78,30 @@ class GpuPhases(RunPhases):
         return getattr(self, phase.name)
 
     @ti.func
+    def in_layers(self, at: ti.template(), node: ti.template(), do: ti.template()):
+        """Do something at a node, for each layer that has it in use."""
+        if ti.static(at.grid.layers == 1):
+            ti.static(do)(at, node)
+        else:
+            for layer in range(self.layer_count(at)):
+                own = self.used_by(at, layer)
+                inside = True
+                for a in ti.static(range(self.dimension)):
+                    inside = inside and node[a] >= own[0, a] and node[a] < own[0, a] + own[1, a]
+                if inside:
+                    (inner,) = ti.static((at.in_layer(layer, own),))
+                    ti.static(do)(inner, node)
+
+    @ti.func
     def each_node(self, at: ti.template()):
         """Do what the phase says for a node."""
         if at.q < at.grid.box_nodes():
-            ti.static(at.item)(at, at.grid.box_node(at.q), at.step.kick)
+            self.in_layers(at, at.grid.box_node(at.q), self.do_item)
+
+    @ti.func
+    def do_item(self, at: ti.template(), node: ti.template()):
+        """Do what the phase says for a node of a layer."""
+        ti.static(at.item)(at, node, at.step.kick)
 
     @ti.func
     def shift_node(self, at: ti.template()):
@@ -105,7 +119,16 @@ class GpuPhases(RunPhases):
     def clear(self, at: ti.template()):
         """Clear a node."""
         if at.q < at.grid.box_nodes():
-            at.grid.clear(at.grid.linear_index(at.grid.box_node(at.q)))
+            node = at.grid.box_node(at.q)
+            self.in_layers(at, node, self.clear_node)
+            if ti.static(self.separates):
+                place = self.device.contact.surfaces.place_of(at.grid, at.w, at.grid.linear_index(node))
+                self.device.contact.surfaces.clear(place)
+
+    @ti.func
+    def clear_node(self, at: ti.template(), node: ti.template()):
+        """Clear a node of a layer."""
+        at.grid.clear(at.grid.linear_index(node))
 
     @ti.func
     def average(self, at: ti.template()):
@@ -115,7 +138,13 @@ class GpuPhases(RunPhases):
     @ti.func
     def scatter(self, at: ti.template()):
         """Scatter a particle."""
-        at.particles.scatter(at.g, at.group, at.q, at.step.kick, at.step.relaxed)
+        layer = at.group.layer_of(at.q)
+        (particles,) = ti.static((self.beside(at, layer),))
+        particles.scatter(at.g, at.group, at.q, at.step.kick, at.step.relaxed)
+
+    def beside(self, at: Item, layer: object) -> ParticleUpdate:
+        """Return the update of particles whose nodes are those of a layer, a variable of a kernel."""
+        return at.particles if at.grid.layers == 1 else at.particles.beside(at.grid.in_layer(layer, None))
 
     @ti.func
     def to_float(self, at: ti.template()):
@@ -140,18 +169,26 @@ class GpuPhases(RunPhases):
     @ti.func
     def find_friction(self, at: ti.template()):
         """Find the friction of a wall."""
-        if at.q < at.nodes.images.plane_nodes(at.grid):
-            find_friction(at.nodes.images, at.grid, at.q, self.gravity_of(at.step))
+        for layer in range(self.layer_count(at)):
+            own = self.used_by(at, layer)
+            (inner,) = ti.static((at.in_layer(layer, own),))
+            (grid,) = ti.static((inner.grid.within(own) if at.grid.layers > 1 else at.grid,))
+            if at.q < inner.nodes.images.plane_nodes(grid):
+                find_friction(inner.nodes.images, grid, at.q, self.gravity_of(at.step))
 
     @ti.func
     def update(self, at: ti.template()):
         """Turn the momentum of a node into velocity."""
         if at.q < at.grid.box_nodes():
-            node = at.grid.box_node(at.q)
-            squared = at.nodes.update(node, at.grid.linear_index(node), self.gravity_of(at.step))
-            # The comparison may be late, and saves most atomics.
-            if squared > at.step.speed_squared:
-                ti.atomic_max(at.step.speed_squared, squared)
+            self.in_layers(at, at.grid.box_node(at.q), self.update_node)
+
+    @ti.func
+    def update_node(self, at: ti.template(), node: ti.template()):
+        """Turn the momentum of a node of a layer into velocity."""
+        squared = at.nodes.update(node, at.grid.linear_index(node), self.gravity_of(at.step))
+        # The comparison may be late, and saves most atomics.
+        if squared > at.step.speed_squared:
+            ti.atomic_max(at.step.speed_squared, squared)
 
     @ti.func
     def meet(self, at: ti.template()):
@@ -175,9 +212,73 @@ class GpuPhases(RunPhases):
     @ti.func
     def advance(self, at: ti.template()):
         """Gather and move a particle."""
-        rate = at.particles.advance(at.g, self.device.groups[at.g], at.q, at.step.dt, self.gravity_of(at.step))
+        layer = at.group.layer_of(at.q)
+        (particles,) = ti.static((self.beside(at, layer),))
+        rate = particles.advance(at.g, self.device.groups[at.g], at.q, at.step.dt, self.gravity_of(at.step))
         if rate > at.step.rate[at.g]:
             ti.atomic_max(at.step.rate[at.g], rate)
+
+    # Bodies with velocity fields of their own, see `contact.body_contact`.
+
+    @ti.func
+    def find_bodies(self, at: ti.template()):
+        """Find which bodies are at a node, and whether they meet anything."""
+        box = self.near_bodies(at)
+        grid, obstacles = ti.static((at.grid.within(box), at.obstacles()))
+        if at.q < grid.box_nodes():
+            self.device.contact.surfaces.find(grid, obstacles, at.w, grid.box_node(at.q))
+
+    @ti.func
+    def show_surface(self, at: ti.template()):
+        """Find what a particle shows."""
+        box = self.near_bodies(at)
+        (grid,) = ti.static((at.grid.within(box),))
+        self.device.contact.surfaces.count_particle(at.g, grid, at.w, at.q)
+
+    @ti.func
+    def reserve(self, at: ti.template()):
+        """Reserve places for what is shown at a node."""
+        self.at_bins(at, self.device.contact.surfaces.reserve)
+
+    @ti.func
+    def put(self, at: ti.template()):
+        """Put a particle into its place."""
+        box = self.near_bodies(at)
+        (grid,) = ti.static((at.grid.within(box),))
+        self.device.contact.surfaces.put(at.g, grid, at.w, at.q)
+
+    @ti.func
+    def chain(self, at: ti.template()):
+        """Make lists of what is shown at a node."""
+        self.at_bins(at, self.device.contact.surfaces.chain)
+
+    @ti.func
+    def at_bins(self, at: ti.template(), do: ti.template()):
+        """Do something with the bins of a node where bodies may meet."""
+        box = self.near_bodies(at)
+        (grid,) = ti.static((at.grid.within(box),))
+        if at.q < grid.box_nodes():
+            place = self.device.contact.surfaces.place_of(grid, at.w, grid.linear_index(grid.box_node(at.q)))
+            ti.static(do)(at.w, place)
+
+    @ti.func
+    def exchange(self, at: ti.template()):
+        """Let bodies exchange momentum at some nodes, and walls and colliders push them."""
+        box, gravity_step, q = self.near_bodies(at), self.gravity_of(at.step), at.q
+        grid, obstacles, threads = ti.static((at.grid.within(box), at.obstacles(), self.device.contact.threads))
+        while q < grid.box_nodes():
+            node = grid.box_node(q)
+            self.device.contact.exchange_all(
+                grid,
+                obstacles,
+                at.w,
+                at.w * threads + at.q,
+                node,
+                grid.linear_index(node),
+                at.step.dt,
+                gravity_step,
+            )
+            q += threads
 
     # What is done beside the steps.
 
@@ -209,6 +310,11 @@ class GpuPhases(RunPhases):
         return view.orders[g].first_node_of(p)
 
     @ti.func
+    def layer_of(self, g: ti.template(), w: int, p: int):
+        """Return the layer of a particle, counted over all runs."""
+        return w * ti.static(self.device.grid.layers) + self.device.groups[g].layer_of(p)
+
+    @ti.func
     def nodes_in_use(self, w: int):
         """Return the number of nodes in use, of those on the planes of faces, and of rows."""
         (run,) = ti.static((self.run(w),))
@@ -227,7 +333,7 @@ SHIFT, FIRST, ROUND = range(3)
 # Turns on a GPU of a round, and of the phase that moves bodies.
 TURNS = {"meet": 2, "move_bodies": 3}
 # What phases run over beside particles, see `Phase`.
-OVER = ("nodes", "planes", "rows", "loads", "bodies")
+OVER = ("nodes", "planes", "rows", "loads", "bodies", "threads")
 
 
 @ti.data_oriented
@@ -251,6 +357,7 @@ class GpuLaunch:
         self.sorts, self.moved = device.sorts, sorted_fields(groups)
         self.averages = any(group.uses_f_bar for group in groups)
         self.loads = device.colliders.loads.rows * device.colliders.loads.capacity if device.nodes.collides else 0
+        self.threads = device.contact.threads if device.contact is not None else 0
         runs, widest = self.runs, max(entries(group) for group in groups)
         self.counts, self.numbers = self.phases.counts, self.phases.numbers
         self.stepping, self.begun, self.sorting = (ti.field(int, shape=runs) for _ in range(3))
@@ -528,12 +635,18 @@ class GpuLaunch:
         """Find the nodes that runs use until their next sort; all of them where particles are not sorted."""
         for w, a in ti.ndrange(self.runs, self.dimension):
             self.stencils[2 * w, a], self.stencils[2 * w + 1, a] = 2**30, -1
+        if ti.static(self.phases.separates):
+            for w in range(self.runs):
+                if self.sorting[w] == 1:
+                    self.device.contact.surfaces.forget(w)
         if ti.static(self.sorts):
             for g, _group in ti.static(self.members):
                 for p in range(self.runs * self.capacity[g]):
                     w = p // self.capacity[g]
                     if self.sorting[w] == 1 and self.takes_part(g, w, p):
                         base = self.phases.first_node_of(g, w, p)
+                        if ti.static(self.phases.separates):
+                            self.device.contact.surfaces.widen(self.phases.layer_of(g, w, p), base)
                         for a in ti.static(range(self.dimension)):
                             # The comparisons may be late, and save most atomics.
                             if base[a] < self.stencils[2 * w, a]:
@@ -557,7 +670,7 @@ class GpuLaunch:
                     self.device.grid.box[2 * w + 1, a] = last - first + 1
         for k in range(3):
             self.reach[k] = 0
-        self.reach[3], self.reach[4] = self.loads, 1
+        self.reach[3], self.reach[4], self.reach[5] = self.loads, 1, self.threads
         for w in range(self.runs):
             nodes, planes, rows = self.phases.nodes_in_use(w)
             ti.atomic_max(self.reach[0], nodes)

@@ -361,6 +361,8 @@ class Run:
             if (rigid := self.batch.device.rigid) is not None:
                 loads["rigid"], taken = rigid.read(self.slot)
                 loads["collider"][list(rigid.free)] += taken
+            if (contact := self.batch.device.contact) is not None:
+                loads |= contact.read(self.slot)
             gpu = self.batch.gpu
             gpu.begin_frame(self.batch.numbers, self.batch.counts)
             for g, group in enumerate(self.groups):

@@ -34,7 +34,7 @@ class Phase:
     Attributes:
         name: of its body.
         over: what it runs over: the nodes in use, those on the planes of faces, their rows, the particles of a group,
-            all rows of nodes for each collider, or runs, whose bodies move.
+            all rows of nodes for each collider, threads that work at nodes, or runs, whose bodies move.
         group: number of the group of particles.
         adds: whether particles add to nodes. Without atomics pencils of one colour after another do.
         turns: how often it runs, with `turn` counting up from 0.
@@ -45,7 +45,7 @@ class Phase:
     """
 
     name: str
-    over: Literal["nodes", "planes", "rows", "particles", "loads", "bodies"]
+    over: Literal["nodes", "planes", "rows", "particles", "loads", "threads", "bodies"]
     group: int = 0
     adds: bool = False
     turns: int = 1
@@ -64,14 +64,16 @@ def step_phases(
     loads: bool = False,
     shifts: int = 0,
     separates: bool = False,
+    serial: bool = True,
     rigid: bool = False,
 ) -> tuple[Phase, ...]:
     """Return the phases of a step; neighbours of one name that add nothing to nodes may be carried out at once.
 
     uses_f_bar: whether the particles of each law share their change of volume; contact, friction: whether walls let go,
     or rub; deterministic: whether P2G is in fixed point; loads: whether there are colliders, too; shifts: the
-    dimension where particles are shifted, else 0; separates: whether bodies meet by their surfaces; rigid: whether
-    colliders move freely. To meet them takes two turns a round: over nodes, and over the bodies.
+    dimension where particles are shifted, else 0; separates: whether bodies meet by their surfaces; serial: whether
+    one thread lists what these show, on a CPU; rigid: whether colliders move freely. To meet them takes two turns a
+    round: over nodes, and over the bodies.
     """
     groups = range(len(laws))
     return (
@@ -83,8 +85,11 @@ def step_phases(
         *(Phase("relax", "particles", g) for g in groups if laws[g].relaxes),
         *[Phase("find_bodies", "nodes")] * separates,
         *(Phase("show_surface", "particles", g) for g in groups if separates and laws[g].elastic),
-        *[Phase("link_surfaces", "particles")] * separates,
-        *[Phase("exchange", "nodes")] * separates,
+        *[Phase("link_surfaces", "particles")] * (separates and serial),
+        *[Phase("reserve", "nodes")] * (separates and not serial),
+        *(Phase("put", "particles", g) for g in groups if separates and not serial and laws[g].elastic),
+        *[Phase("chain", "nodes")] * (separates and not serial),
+        *[Phase("exchange", "threads")] * separates,
         *[Phase("find_contact", "planes")] * contact,
         *[Phase("find_friction", "planes")] * friction,
         *[Phase("meet", "rows", turns=2 * ROUNDS)] * rigid,

@@ -489,6 +489,8 @@ def wants_sparse(scene: Scene) -> bool:
     """Return whether the grid of a scene is sparse on the CPU, whatever machine that is."""
     if scene.solver.grid != "auto":
         return scene.solver.grid == "sparse"
+    if any(map(scene.separates, scene.sources)):
+        return False
     cells = math.prod(scene.domain.cells)
     return cells >= MANY_CELLS and filled_cells(scene) <= FILLED * cells
 

@@ -27,6 +27,7 @@ from mpmcli.plain_text import size_text
 from mpmcli.scene import Scene
 from mpmcli.scene.sampling import count_body, estimate_body, has_expressions
 from mpmcli.scene.sheets import sheets_of
+from mpmcli.solver.contact.body_contact import BodyContact
 from mpmcli.solver.contact.layers import Layers, require_contact_possible
 from mpmcli.solver.contact.surfaces import BodySurfaces
 from mpmcli.solver.contact.total_solids import ParticleContact, bins_along, slips_in
@@ -357,7 +358,11 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
     if sparse:
         tables += SparseGrid.table_bytes(all_tiles, blocks, dimension)
     surfaced = [in_steps(counts[law.name]) for law in members if separate and law.elastic]
-    tables += BodySurfaces.bytes_needed(nodes, all_tiles, surfaced, real * (2 * dimension + 1)) if surfaced else 0
+    if surfaced:
+        shown_bytes = real * (2 * dimension + 1)
+        tables += BodySurfaces.bytes_needed(nodes, all_tiles, surfaced, shown_bytes, on_cpu=backend.on_cpu)
+        if not backend.on_cpu:
+            tables += BodyContact.gpu_bytes(scheme.spline.nodes, fields_of, dimension, real)
     tables += layers * _contact_bytes(scene, all_nodes, tile, Grid.tile_counts(cells, tile), real)
     if scene.solver.solids == "total" and len(scene.sources) > 1:
         tables += ParticleContact.bytes_needed(cells, sum(map(in_steps, counts.values())))

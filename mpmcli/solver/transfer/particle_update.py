@@ -102,7 +102,7 @@ class ParticleUpdate:
         """Scatter one particle, with atomics; one that is crushed is lost: its stress would spread NaN."""
         state, row = group.stored(p), group.row(p)
         if volume_ratio(group, state) > SMALLEST_J:
-            (grid,) = ti.static((self.grid,))
+            (grid,) = ti.static((self.near,))
             v, C = group.motion(p)
             inner, constants = group.inner(p), group.constants(p)
             place, here = group.on_grid(p), group.x[p]
@@ -151,7 +151,7 @@ class ParticleUpdate:
         deformation, constants = group.deformation(p), group.constants(p)
         base, distance = grid.scheme.spline.stencil(group.on_grid(p), grid.inverse_spacing)
         w = grid.scheme.spline.weights(distance)
-        all_sums, moments = gather_linear(grid.nodes, grid, grid.linear_index(base), w)
+        all_sums, moments = gather_linear(grid.nodes, self.near, self.near.linear_index(base), w)
         velocity, moment = columns(all_sums, moments, 0, d)
         kept = ti.static(grid.kept if grid.scheme.keeps_flip_velocity else 0)
         old_velocity, old_moment = columns(all_sums, moments, kept, d)
