@@ -177,11 +177,11 @@ def _impact(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
     if isinstance(form, Ball):
         # What an impact of a ball brings together, sqrt(2 h / R + 4 mach) a side.
         share = min(1.0, (2 * h / form.radius + 4 * mach) ** ((len(form.center) - 1) / 2))
-    length = chord(form, velocity / speed)
+    length, surfaces = chord(form, velocity / speed), scene.separates(body.body)
 
     def lost(settings: SolverSettings, spacing: float) -> float:
         # Waves cross as many cells in a step with any spacing.
-        return share * impact_loss(settings, length / spacing, mach, courant)
+        return share * impact_loss(settings, length / spacing, mach, courant, surfaces=surfaces)
 
     now = lost(scene.solver, h)
     if not now >= NOTED_SHARE:
@@ -191,14 +191,14 @@ def _impact(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
         f"{length / h:.3g} cells long, loses about {_percent(now)} of the energy to the transfers, at steps of "
         f"{courant * h / waves:.3g} s."
     )
-    fix = _cure(facts, lost(scene.solver, h / 2), lost(_aflip(scene.solver), h))
+    fix = _cure(facts, lost(scene.solver, h / 2), None if surfaces else lost(_aflip(scene.solver), h))
     yield Finding("note", "impact-loss", what, fix, now, body.name)
 
 
-def _cure(facts: SceneFacts, finer: float, aflip: float) -> str:
-    """Return what lowers a loss, given what half the spacing and AFLIP leave of it."""
+def _cure(facts: SceneFacts, finer: float, aflip: float | None) -> str:
+    """Return what lowers a loss, given what half the spacing and AFLIP leave of it; None where AFLIP lowers nothing."""
     ways = [f"Half the spacing leaves {_percent(finer)}"]
-    if facts.scene.solver.transfer != "aflip":
+    if facts.scene.solver.transfer != "aflip" and aflip is not None:
         ways.append(f'solver.transfer = "aflip" {_percent(aflip)}')
     return ", ".join(ways) + "."
 

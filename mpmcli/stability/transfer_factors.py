@@ -23,6 +23,8 @@ FARTHEST = 0.2
 IMPACT_LOSS, SLOW = 0.165, 1 / 14
 # The least that AFLIP leaves of it.
 IMPACT_OF_AFLIP = 0.12
+# The same exponent times n where bodies meet by their surfaces, whatever the speed, the step and the transfer.
+IMPACT_OF_SURFACES = 1.6
 
 
 def affine_moment(settings: SolverSettings) -> float:
@@ -49,15 +51,20 @@ def loss_per_step(settings: SolverSettings, kh: float) -> float:
     return (1 - (settings.flip or 0.0)) * APIC_LOSS[settings.kernel] * square * square
 
 
-def impact_loss(settings: SolverSettings, cells: float, mach: float, courant: float) -> float:
+def impact_loss(
+    settings: SolverSettings, cells: float, mach: float, courant: float, *, surfaces: bool = False
+) -> float:
     """Return the share of its energy that a head-on impact of elastic bodies loses; right within a factor of 2.
 
     Bodies meet about two cells early, where their kernels couple them softly. The nodes between them see the jump of
     velocity in each step until the gap is closed: the loss counts the steps of that time, and the layers that lose are
     about a cell thick whatever the length of the bodies (docs/theory.md, 2.5). `cells` is the length of each body in
     the direction of the impact, or of one before a wall, `mach` the speed of each relative to their mean, or to the
-    wall, over their wave speed, and `courant` the wave speed times step over spacing.
+    wall, over their wave speed, and `courant` the wave speed times step over spacing. `surfaces`: whether the bodies
+    have velocity fields of their own.
     """
+    if surfaces:
+        return -math.expm1(-IMPACT_OF_SURFACES / cells)
     factor = APIC_LOSS[settings.kernel] / APIC_LOSS["quadratic"]
     if settings.transfer == "aflip":
         factor *= max(1 - (settings.flip or 0.0), IMPACT_OF_AFLIP)
