@@ -1,8 +1,7 @@
-"""Reads expressions from text, which is never run as Python.
+"""Reads expressions from text; the text is never run as Python.
 
-Python's parser splits the text, and of what it returns only what stands in the tables of `expression` is taken. A
-comparison is true or false and no number: it may stand where a condition is needed, in `a if c else b`, `and`, `or` and
-`not`, and nowhere else.
+Python's parser splits the text; only nodes in the tables of `expression` are accepted. A comparison is a truth value,
+not a number: it is allowed only where a condition is needed, in `a if c else b`, `and`, `or` and `not`.
 """
 
 import ast
@@ -31,7 +30,7 @@ from mpmcli.scene.expression import (
 )
 from mpmcli.scene.problem import listed
 
-# An expression of a scene is a formula that a person has written; kernels hold all of it.
+# Limits for formulas written by hand; kernels contain the whole expression.
 MOST_CHARACTERS = 2000
 MOST_NESTED = 60
 TOO_DEEP = f"is nested more than {MOST_NESTED} deep, each term of a sum counted; write it shorter"
@@ -51,9 +50,9 @@ _INSTEAD = {
 def parse(
     text: str, names: Collection[str], constants: Mapping[str, ast.expr] = MappingProxyType({})
 ) -> Expression | float:
-    """Read an expression of some names, and of constants that stand for others; its value where it depends on nothing.
+    """Read an expression of the given names and constants; return its value if it depends on no name.
 
-    The sentence of an ExpressionError goes on after the place of the value.
+    The message of an ExpressionError continues a sentence that begins with the place of the value.
     """
     if len(text) > MOST_CHARACTERS:
         raise ExpressionError(f"is too long for an expression: {len(text)} characters, {MOST_CHARACTERS} at most")
@@ -94,7 +93,7 @@ def parse(
 
 
 class _PutIn(ast.NodeTransformer):
-    """Replaces constants by what they stand for; what is called keeps its name."""
+    """Replaces constants by their expressions; names of called functions stay."""
 
     def __init__(self, constants: Mapping[str, ast.expr]) -> None:
         self.constants = constants
@@ -112,7 +111,7 @@ def _cut(text: str) -> str:
 
 
 class _Reader:
-    """Turns what Python's parser returns into a tree, or into a sentence on what has no place in an expression."""
+    """Converts the nodes of Python's parser to a tree, or raises an ExpressionError for a node that is not allowed."""
 
     def __init__(self, source: str, names: tuple[str, ...]) -> None:
         self.source = source
@@ -225,7 +224,7 @@ class _Reader:
 
 
 def _unknown(kind: str, word: str, shown: Collection[str], known: tuple[str, ...]) -> str:
-    # A name that differs in its case alone is nearest.
+    # A name that differs only in case is nearest.
     cased = [one for one in known if one.lower() == word.lower()]
     guess = next(iter(cased or difflib.get_close_matches(word, known, n=1)), None)
     hint = f'did you mean "{guess}"? ' if guess else ""
