@@ -46,8 +46,7 @@ class Parts:
 
 @np.errstate(all="ignore")
 def parts_of(tree: Tree, start: float, end: float, *, precise: bool = True) -> Parts:
-    """Subdivide the time from `start` to `end` (s) until a tree of t is resolved in every part; a truth value is 1 or
-    0.
+    """Subdivide `start` to `end` (s) so that a tree of t is resolved in every part; a truth value is 1 or 0.
 
     If `precise`, the parts suit an integral; otherwise they only locate every feature.
     """

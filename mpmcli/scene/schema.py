@@ -369,7 +369,7 @@ class Scene(Table):
 
     @property
     def contact_pairs(self) -> tuple[tuple[str, str], ...]:
-        """Names of each pair of velocity fields, in the order of the ledger; a body that separates has its own field."""
+        """Names of each pair of velocity fields, in the order of the ledger; bodies that separate have their own."""
         shared = ", ".join(source.name for source in self.sources if not self.separates(source))
         names = [shared] * bool(shared) + [source.name for source in self.sources if self.separates(source)]
         return tuple((first, second) for k, second in enumerate(names) for first in names[:k])
