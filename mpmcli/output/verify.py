@@ -100,8 +100,9 @@ def verify_result(path: Path) -> Verification:
 
 
 def verify_file(path: Path, *, frames: bool = True, stop: Callable[[], bool] = lambda: False) -> Verification:
-    """Compare a VTKHDF file with its checksums; `frames` is False for colliders.  KeyboardInterrupt: `stop`
-    returned True.
+    """Compare a VTKHDF file with its checksums; `frames` is False for colliders.
+
+    KeyboardInterrupt: `stop` returned True.
     """
     found = Verification(path, files=1)
     try:
