@@ -1,4 +1,4 @@
-"""Findings of a check: each states what is wrong, the number that shows it, and what to change."""
+"""Findings of a check: each states a fault, the number that shows it, and the change that removes it."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -7,7 +7,7 @@ from typing import Literal
 from mpmcli.plain_text import counted
 
 Severity = Literal["error", "warning", "note"]
-# Of a run; a check of its files finds the first three, the others stopped it.
+# Verdicts of a run; a check of its files finds the first three, the others stopped it.
 Verdict = Literal["stable", "suspect", "unstable", "escaped", "failed"]
 # In decreasing order of severity.
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
@@ -27,7 +27,7 @@ class Finding:
 
     @property
     def line(self) -> str:
-        """The finding in one line: severity, what, and what to change."""
+        """The finding in one line: severity, fault and change."""
         return f"{self.severity}: {self.what} {self.fix}"
 
 
