@@ -223,7 +223,7 @@ def flow_width(facts: SceneFacts, body: BodyFacts) -> float:
 
 
 def chord(form: Form, direction: np.ndarray) -> float:
-    """Return the mean length of a shape along a unit vector, m: volume over the projection of the ball or bounding box."""
+    """Return the mean length of a shape along a unit vector, m: volume over projection of the ball or bounding box."""
     if isinstance(form, Ball):
         return form.radius * (math.pi / 2 if len(direction) == 2 else 4 / 3)
     # The bounding box of points ends at their centres.
