@@ -78,7 +78,7 @@ def density_colors(
 
 
 class DensityPainter:
-    """Draws the density of the grid in a plane, which fades out where there is little."""
+    """Draws the density of the grid in a plane; small values fade into the background."""
 
     fields: tuple[str, ...] = ()
 
