@@ -1,4 +1,4 @@
-"""Checks the frames of a result: values, momentum, distances of neighbours, and clusters."""
+"""Checks the frames of a result: values, momentum, distances of neighbours, and crowds."""
 
 from collections.abc import Iterator
 from typing import ClassVar
@@ -29,7 +29,7 @@ STRETCHED, SPARSE = 0.9, 1.25
 TORN = 1.5
 # Distance at the start, over that of a lattice, up to which two particles count as neighbours; the diagonal is at 1.41.
 NEIGHBOUR = 1.2
-# Number of frames of a run that are searched for clusters, and the largest number of cells around its material.
+# Number of frames of a run that are searched for crowds, and the largest number of cells around its material.
 FEW, MOST_CELLS = 4, 3e7
 # Particles in a cell over the nominal number, and fraction of empty cells inside, that are reported.
 CROWDED, GAPS = 3.0, 0.05
@@ -270,7 +270,7 @@ class StretchCheck(FrameCheck):
 
 
 class CrowdCheck(FrameCheck):
-    """Finds clusters of liquids and grains, and viscous liquids that spray, in a few frames and the last one.
+    """Finds crowds of liquids and grains, and viscous liquids that spray, in a few frames and the last one.
 
     Its figures are those of the last frame examined, None without such material.
     """
@@ -281,7 +281,7 @@ class CrowdCheck(FrameCheck):
         super().__init__(header, findings)
         self._flows = np.array([law.name in laws() and laws()[law.name].flows for law in header.laws], bool)
         self._share = np.array([1 / body.particles_per_cell for body in header.bodies])
-        # With fewer than two particles along an axis a cluster may be due to chance.
+        # With fewer than two particles along an axis a crowd may be due to chance.
         coarse = (self._share > 2.0**-header.dimension).any()
         known = header.spacing is not None and header.origin is not None and self._flows.any()
         self._looked_at = {*range(0, last + 1, max(1, (last + 1) // FEW)), last} if known and not coarse else set()

@@ -30,7 +30,7 @@ def parameter_models() -> tuple[type[MaterialParameters], ...]:
 
 
 def load_plugins(paths: Sequence[Path]) -> tuple[type[MaterialParameters], ...]:
-    """Replace all loaded plugins by these, and return the parameter models of all laws.
+    """Replace all loaded plugins by the given ones, and return the parameter models of all laws.
 
     Each is a Python file that is run and defines `LAW`. InputError: there is no such file, it fails, its LAW is
     incomplete, or the name of the law is taken.
@@ -70,7 +70,7 @@ def _own_laws() -> dict[str, type[Law]]:
 
 
 def _run(path: Path) -> ModuleType:
-    """Execute a file and return it as a module, without writing a cache beside it."""
+    """Execute a file and return it as a module, without writing a cache file."""
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:

@@ -82,7 +82,7 @@ class VonMises(HenckyLaw):
 
     @ti.func
     def strains(self, s: ti.template(), internal: ti.template()):
-        """Return the three principal Hencky strains, that out of the plane last in 2D."""
+        """Return the three principal Hencky strains, in 2D with the out-of-plane strain last."""
         in_frame = hencky_strains(s)
         e = ti.Vector([in_frame[0], in_frame[1], 0.0])
         if ti.static(self.dimension == 2):
