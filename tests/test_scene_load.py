@@ -118,7 +118,7 @@ def test_files_that_are_no_scene():
         "nope.toml": "nope.toml: there is no such file; give the path of a scene in TOML",
         "directory": "directory: this is a directory; give the path of a scene in TOML",
         "result": "result: this is a directory; did you mean result/scene.toml?",
-        "binary": "binary: this is no text in UTF-8 (byte 8 is 0xff); give a scene in TOML",
+        "binary": "binary: this is not text in UTF-8 (byte 8 is 0xff); give a scene in TOML",
     }.items():
         with pytest.raises(InputError) as refused:
             load_scene(path, laws=parameter_models())

@@ -80,8 +80,8 @@ def _locking(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
         return
     has = f'Body "{body.name}" has a Poisson\'s ratio of {ratio:g}'
     if facts.scene.solver.f_bar is not False and not body.flows:
-        lost = "its steps are small, and as each of them damps what moves, it swings less far than it should."
-        fix = f"Set poissons_ratio = {LOCKING:g} or less, where the difference does not matter."
+        lost = "its steps are small, and because each of them damps motion, its swings are too small."
+        fix = f"Set poissons_ratio = {LOCKING:g} or less, if the difference does not matter."
         yield Finding("note", "locking", f"{has}: {lost}", fix, ratio, body.name)
         return
     lost = f"above {LOCKING:g} it bends too stiffly, its pressure varies from particle to particle, and its steps are "
@@ -101,7 +101,7 @@ def _friction(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
         f'The friction angle of body "{body.name}", {angle:.3g} degrees in plane strain, acts as {compression:.1f} '
         f"degrees in triaxial compression and as {extension:.1f} degrees in extension."
     )
-    fix = "Give the angle of plane strain; where compression from all sides decides, as in a cone's middle, give more."
+    fix = "Give the angle of plane strain; where triaxial compression dominates, as in the middle of a cone, give more."
     yield Finding("warning" if extension - angle > STEEP else "note", "friction", what, fix, angle, body.name)
 
 
@@ -113,8 +113,8 @@ def _density(facts: SceneFacts) -> Iterator[Finding]:
     ratio = heavy.body.material.density / light.body.material.density
     if ratio > DENSITY_RATIO:
         what = (
-            f'Body "{heavy.name}" is {ratio:.3g} times as dense as body "{light.name}": on the nodes that they share '
-            "the light one is carried along."
+            f'Body "{heavy.name}" is {ratio:.3g} times as dense as body "{light.name}": on shared nodes the '
+            "light one is dragged along."
         )
         fix = f"Keep the ratio of densities under {DENSITY_RATIO:g}, or leave the light body out."
         yield Finding("warning", "density-ratio", what, fix, ratio, light.name)

@@ -36,7 +36,7 @@ TOLD = {
     "contact_overlap": "deepest overlap of surfaces, cells",
     "contact_gap": "largest gap that acts, cells",
     "neighbour_distance": "farthest neighbours, cells",
-    "densest_cell": "densest cell / meant",
+    "densest_cell": "densest cell / intended",
     "empty_cells": "empty cells inside",
     "step_min": "smallest step, s",
     "step_max": "largest step, s",

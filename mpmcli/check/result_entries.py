@@ -30,9 +30,9 @@ ENDS: dict[str, tuple[Severity, str, str, str]] = {
     "failed": ("error", "failed-run", "The run failed after {far}{told}", "Run it again."),
     "interrupted": ("warning", "interrupted-run", "The run was interrupted after {far}", GO_ON),
     "stopped": ("warning", "stopped-run", "The run stopped after {far}{told}", GO_ON),
-    DIED: ("warning", "died-run", "The run died after {far}: its process has ended and left no word", GO_ON),
+    DIED: ("warning", "died-run", "The run died after {far}: its process has ended without recording it", GO_ON),
     "running": ("warning", "running", GOES_ON + "it goes on", WAIT),
-    ELSEWHERE: ("warning", "running", GOES_ON + "whether it goes on cannot be seen from here", WAIT),
+    ELSEWHERE: ("warning", "running", GOES_ON + "whether it continues cannot be determined", WAIT),
 }
 
 

@@ -91,8 +91,8 @@ class StateCheck(FrameCheck):
         opened = any(header.open_axes)
         if frame.index > 0 and not opened and held > HELD * len(out):
             what = f"In frame {frame.index} {held} of {counted(len(out), 'particle')} lie on a wall"
-            what += ", where the domain holds what would leave it: the rest of their way is lost"
-            fix = 'With solids = "total" a stiffer material gives way less; "updated" lets none so near.'
+            what += ", where the domain keeps particles that would leave it: the rest of their displacement is lost"
+            fix = 'With solids = "total" a stiffer material deforms less; "updated" keeps particles away from walls.'
             self._findings.add("note", "held-positions", frame.index, what, fix, value=held / len(out))
         # At an open face particles stay outside until the next sort.
         late = 2 * header.spacing * np.array(header.open_axes) if opened else 0.0
@@ -240,9 +240,9 @@ class StretchCheck(FrameCheck):
                 continue
             severity = "warning" if cells > TORN else "note"
             count = int((squares > (allowed * h) ** 2).sum())
-            told = f"farther than {TORN:g}, which a kernel reaches: it has torn, which its material cannot"
+            told = f"farther than {TORN:g}, the reach of a kernel: it has torn, although its material cannot"
             if severity == "note":
-                told = f"above {allowed:.3g}: the grid hardly sees what moves between them, noise grows, and gaps open"
+                told = f"above {allowed:.3g}: the grid hardly resolves motion between them, noise grows, and gaps open"
             what = f'In frame {frame.index} {count} pairs of neighbours of body "{body.name}"'
             what += f" stand up to {cells:.3g} cells apart, {told}"
             per_axis = int(np.ceil(body.particles_per_cell ** (1 / header.dimension) * cells / STRETCHED))
@@ -318,7 +318,7 @@ class CrowdCheck(FrameCheck):
         densest, empty = float(filled.max()), float(holes.mean()) if len(holes) >= ENOUGH else 0.0
         self.figures = {"densest_cell": densest, "empty_cells": empty}
         if densest > CROWDED or empty > GAPS:
-            what = f"In frame {frame.index} a cell of liquid or grains has {densest:.3g} times the particles meant"
+            what = f"In frame {frame.index} a cell of liquid or grains has {densest:.3g} times the intended particles"
             what += f", and {100 * empty:.2g} % of the cells inside have none: flow has piled particles up"
             fix = 'Refine the domain, or set sampling = "turned".'
             if not header.shifts:

@@ -140,7 +140,7 @@ def _stretched(facts: SceneFacts) -> Iterator[Finding]:
             continue
         what = (
             f'The start of body "{body.name}" stretches it by about {stretch:.3g}, so that its particles come to stand '
-            f"{cells:.3g} cells apart: above {STRETCHED:g} the grid hardly sees what moves between them, noise grows, "
+            f"{cells:.3g} cells apart: above {STRETCHED:g} the grid hardly resolves motion between them, noise grows, "
             f"and above {TORN:g} it tears."
         )
         more = f"Set particles_per_cell = {math.ceil(stretch / STRETCHED) ** d}, or start" if stretch < 10 else "Start"
@@ -200,8 +200,8 @@ def _rotation(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
         return
     does = "flies apart" if strain > BURST else "widens"
     what = (
-        f'Body "{body.name}" spins so that its rim has {rim:.3g} m/s and its waves {waves:.3g} m/s: it is strained by '
-        f"about {100 * strain:.2g} %, and {does}."
+        f'Body "{body.name}" spins with a rim speed of {rim:.3g} m/s and a wave speed of {waves:.3g} m/s: it is '
+        f"strained by about {100 * strain:.2g} %, and {does}."
     )
     least = strain / STRAINED
     fix = f"Spin it {math.sqrt(least):.2g} times slower, or make it {least:.2g} times as stiff."
@@ -216,7 +216,7 @@ def _rigid(facts: SceneFacts) -> Iterator[Finding]:
         lower, upper = np.array(body.form.bounds())
         cells = float((upper - lower).min() / h)
         if cells < FEWEST_CELLS:
-            what = f'Rigid body "{body.name}" is {cells:.2g} cells thick: what is on its two sides meets through it.'
+            what = f'Rigid body "{body.name}" is {cells:.2g} cells thick: material on both sides interacts through it.'
             fix = f"Make it {FEWEST_CELLS:g} cells thick, or the spacing {h * cells / FEWEST_CELLS:.2g} m."
             yield Finding("warning", "thin", what, fix, cells, body.name)
         long = np.where(shut.all(axis=1), (upper - lower) / scene.domain.size, 0.0)
@@ -240,8 +240,8 @@ def _rigid(facts: SceneFacts) -> Iterator[Finding]:
                 yield Finding("warning", "overlap", what, f"Move it by {depth * h:.2g} m.", depth, body.name)
             elif depth > -UNDER * (1 - 1e-6) and wet:
                 what = (
-                    f'Rigid body "{body.name}" begins {abs(min(depth, 0)):.2g} cells from {name}: no liquid gets '
-                    "between them, so that it is pressed there and does not float up."
+                    f'Rigid body "{body.name}" begins {abs(min(depth, 0)):.2g} cells from {name}: no liquid '
+                    "enters the gap, so that pressure holds it there and it does not float up."
                 )
                 fix = f"Set it {UNDER * h:.3g} m away if it should."
                 yield Finding("note", "no-liquid-between", what, fix, -depth, body.name)
@@ -260,8 +260,8 @@ def _room(facts: SceneFacts) -> Iterator[Finding]:
         return
     unit = "m^2" if scene.dimension == 2 else "m^3"
     what = (
-        f"Colliders that move leave {ratio * volume:.2g} {unit} at {time:.3g} s to what fills {volume:.2g} {unit} at "
-        f"the start ({names}): it is {'crushed' if ratio < CRUSHED else 'pressed together'}."
+        f"Moving colliders leave {ratio * volume:.2g} {unit} at {time:.3g} s for material that fills "
+        f"{volume:.2g} {unit} at the start ({names}): it is {'crushed' if ratio < CRUSHED else 'pressed together'}."
     )
     fix = "Let them stop earlier, or leave a way out of more than two cells."
     yield Finding("error" if ratio < CRUSHED else "warning", "room", what, fix, ratio)

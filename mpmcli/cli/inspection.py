@@ -51,7 +51,7 @@ def check_command(
     else:
         given = {"--set": overrides, "--plugin": plugins, "--probe": probe, "--threads": threads}
         for option in (option for option, value in given.items() if value):
-            raise InputError(f"{option} is for scenes, and {path} is none; leave it out.")
+            raise InputError(f"{option} is for scenes, and {path} is not one; leave it out.")
         from mpmcli.check.result_check import check_result
 
         check = check_result(path)
@@ -77,7 +77,7 @@ def info_command(
     """
     if verify:
         if path.suffix == ".toml" or overrides or plugins:
-            raise InputError(f"--verify is for results, datasets and exports, and {path} is none; leave it out.")
+            raise InputError(f"--verify is for results, datasets and exports, and {path} is not one; leave it out.")
         from mpmcli.dataset.dataset import is_dataset
         from mpmcli.dataset.export import is_export, verify_export
         from mpmcli.dataset.report import verify as verify_dataset
@@ -92,7 +92,7 @@ def info_command(
     else:
         if overrides or plugins:
             option = "--set changes" if overrides else "--plugin is for"
-            raise InputError(f"{option} scenes, and {path} is none; leave it out.")
+            raise InputError(f"{option} scenes, and {path} is not one; leave it out.")
         facts = _result_facts(path)
     if as_json:
         print_json(facts)

@@ -84,7 +84,7 @@ def duration(text: str) -> float:
     elif not _PARTS.sub("", text).strip():
         seconds = sum(float(number) * SECONDS[unit.lower()] for number, unit in _PARTS.findall(text))
     if not 0 < seconds < math.inf:
-        raise click.BadParameter(f"{text} is no time; give 2h, 90m, 45s, 1h30m or 1:30:00")
+        raise click.BadParameter(f"{text} is not a time; give 2h, 90m, 45s, 1h30m or 1:30:00")
     return seconds
 
 
@@ -94,7 +94,7 @@ def size(text: str) -> int:
     match = _SIZE.fullmatch(text)
     count = float(match[1]) * BYTES[match[2].lower()] if match else 0.0
     if not 1 <= count < 2**63:
-        raise click.BadParameter(f"{text} is no size; give 8GB, 500MB or 8GiB")
+        raise click.BadParameter(f"{text} is not a size; give 8GB, 500MB or 8GiB")
     return int(count)
 
 
@@ -102,7 +102,7 @@ def part(text: str) -> tuple[int, int]:
     """Read a part of the work, `i/n`."""
     first, slash, parts = text.partition("/")
     if not (slash and first.isdecimal() and parts.isdecimal() and 1 <= int(first) <= int(parts)):
-        raise click.BadParameter(f"{text} is no part; give 1/2 for the first of two")
+        raise click.BadParameter(f"{text} is not a part; give 1/2 for the first of two")
     return int(first), int(parts)
 
 
@@ -110,5 +110,5 @@ def thread_counts(text: str) -> tuple[int, ...]:
     """Read comma-separated numbers of threads, such as `1,2`."""
     counts = [word.strip() for word in text.split(",")]
     if not all(count.isascii() and count.isdecimal() and 0 < int(count) < 10**6 for count in counts):
-        raise click.BadParameter(f"{text} is no number of threads; give 2, or 1,2 for each of both")
+        raise click.BadParameter(f"{text} is not a number of threads; give 2, or 1,2 for each of both")
     return tuple(dict.fromkeys(int(count) for count in counts))

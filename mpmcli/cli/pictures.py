@@ -156,7 +156,7 @@ def plot_command(
     opened = open_result(result)
     path = output or (opened.path if opened.path.is_dir() else opened.path.parent) / LEDGER
     if path.suffix.lower() != ".png":
-        raise InputError(f"{path} would be no picture of this command: give a name that ends in .png.")
+        raise InputError(f"{path} cannot be a picture of this command: give a name that ends in .png.")
     digest = digest_of(path)
     if digest is not None and not digest.startswith(MARK) and not overwrite:
         raise InputError(f"{path} is there and was not made by mpmcli plot: give another name, or --overwrite.")

@@ -145,7 +145,7 @@ def _code(status: int) -> int:
         name = f"signal {number}"
     if number == signal.SIGKILL:
         print_error(
-            "error: the process was killed (SIGKILL), perhaps for want of memory; what it had reported is kept."
+            "error: the process was killed (SIGKILL), perhaps for lack of memory; what it had reported is kept."
         )
         os.kill(os.getpid(), signal.SIGKILL)
     print_error(f"error: the process crashed ({name}); what it had reported is kept.")

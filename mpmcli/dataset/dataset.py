@@ -141,7 +141,7 @@ class _ResultTrajectory(Trajectory):
     def __init__(self, result: Result) -> None:
         if result.header.drops:
             raise InputError(
-                f"{result.path} holds only the particles that are there (output.drop_retired): a trajectory has the "
+                f"{result.path} holds only the particles present (output.drop_retired): a trajectory has the "
                 "same ones in all frames; run the scene without it."
             )
         counts = result.particle_counts

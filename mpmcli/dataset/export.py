@@ -100,7 +100,7 @@ def export(
         if gone:
             raise InputError(
                 f"{dataset.path} lacks {counted(len(gone), 'trajectory')} of its manifest, {min(gone):06d} among them: "
-                "what made it was ended, or a file is gone; --trajectory N exports one that is there."
+                "its sweep was interrupted, or a file is missing; --trajectory N exports one that is there."
             )
         lack, told = status.lack(), status.as_dict()
         metadata["dataset"] = {name: told[name] for name in ("part", "trajectories", "done", "accepted", "verdicts")}

@@ -143,7 +143,7 @@ class Manifest:
     @contextmanager
     def _reading(self) -> Iterator[sqlite3.Connection]:
         if not self.path.is_file():
-            raise InputError(f"{self.path.parent} is no dataset: it has no {MANIFEST}.")
+            raise InputError(f"{self.path.parent} is not a dataset: it has no {MANIFEST}.")
         try:
             # Not mode=ro, which cannot roll back the changes of a killed writer.
             with closing(sqlite3.connect(f"file:{self.path}?mode=rw", uri=True)) as connection:

@@ -229,7 +229,7 @@ class Gns(TrainingFormat):
         for each in self.trajectories:
             if each.source.header.periodic.any():
                 raise InputError(
-                    f"trajectory {each.source.number} has periodic faces, which GNS does not know: velocities would "
+                    f"trajectory {each.source.number} has periodic faces, which GNS does not support: velocities would "
                     "jump there, and particles at them lack neighbours; --to lagrangebench and --to npz take them."
                 )
         super().check()

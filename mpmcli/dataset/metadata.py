@@ -138,7 +138,7 @@ def require_alike(trajectories: Sequence[SubsampledTrajectory], form: str) -> No
                 f"{first.source.number} are at first: {form} has one time between frames; {remedy}"
             )
         if header.origin is None or each.spacing is None:
-            raise InputError(f"trajectory {number} does not say its domain and bodies, which {form} needs; {remedy}")
+            raise InputError(f"trajectory {number} lacks domain and bodies in its header, which {form} needs; {remedy}")
 
 
 def time_between(trajectory: SubsampledTrajectory) -> float | None:

@@ -173,7 +173,7 @@ def open_shard(path: Path) -> Iterator[h5py.File]:
         raise InputError(f"{path} is missing: the dataset is not complete.")
     with opened(path, "a whole copy of the dataset") as file:
         if file.attrs.get("format") != FORMAT:
-            raise InputError(f"{path} is no shard of a dataset of mpmcli: its format is not {FORMAT}.")
+            raise InputError(f"{path} is not a shard of a dataset of mpmcli: its format is not {FORMAT}.")
         require_format(path, file.attrs["version"], VERSION)
         yield file
 

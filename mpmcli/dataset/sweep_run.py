@@ -53,7 +53,7 @@ TASK, GPU_TASK, ROUNDS = 8, 128, 8
 # Trajectories after which no split is empty, unless its fraction is less than one trajectory.
 SURE = 1000
 # Reason of failure of a trajectory that killed every worker.
-LOST = "every worker that computed it was killed, perhaps for want of memory."
+LOST = "every worker that computed it was killed, perhaps for lack of memory."
 # Largest numbers of rows in the table of a rehearsal, and of faults below it.
 MOST_ROWS, MOST_FAULTS = 20, 10
 
@@ -407,7 +407,7 @@ class Rehearsal:
         faults = [one for one in self.trajectories if one.fault]
         lines += [f"error: trajectory {one.number}: {one.fault}" for one in faults[:MOST_FAULTS]]
         if len(faults) > MOST_FAULTS:
-            lines.append(f"error: {len(faults) - MOST_FAULTS} more cannot be computed; --json tells why")
+            lines.append(f"error: {len(faults) - MOST_FAULTS} more cannot be computed; --json has the reasons")
         time_text = "" if self.seconds is None else f", about {duration_text(self.seconds)}"
         total, workers = counted(len(self.trajectories), "trajectory"), counted(self.workers, "worker")
         lines += [f'note: no trajectory is in the split "{name}": raise count' for name in self.empty]

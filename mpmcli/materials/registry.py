@@ -76,7 +76,7 @@ def _run(path: Path) -> ModuleType:
     except FileNotFoundError:
         raise InputError(f"{path}: there is no such file; give a Python file that defines LAW") from None
     except (OSError, UnicodeDecodeError) as error:
-        said = error.strerror if isinstance(error, OSError) else "it is no text in UTF-8"
+        said = error.strerror if isinstance(error, OSError) else "it is not text in UTF-8"
         raise InputError(f"{path}: the file cannot be read: {said}") from None
     # The full path: Taichi reads the source of kernels from it later, possibly from another working directory.
     file = str(path.resolve())

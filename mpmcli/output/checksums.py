@@ -67,7 +67,7 @@ def opened(path: Path, wanted: str) -> Iterator[h5py.File]:
             raise
         except DAMAGE as error:
             what = first_line(error)
-            raise DamageError(f"{path} is damaged: what it should hold cannot be read ({what}).") from error
+            raise DamageError(f"{path} is damaged: its content cannot be read ({what}).") from error
 
 
 def require_format(path: Path, found: object, ours: int) -> None:

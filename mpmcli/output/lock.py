@@ -250,7 +250,7 @@ def _refuse_foreign(directory: Path, content: dict[str, Any], *, locks_work: boo
             raise InputError(_held(directory, content))
         return
     raise InputError(
-        f"{directory} was locked by {_named(content)}, and whether that process has ended cannot be seen from here: "
+        f"{directory} was locked by {_named(content)}, and whether that process has ended cannot be determined: "
         f"if it has, remove {Path(directory) / LOCK}; or give another directory with -o."
     )
 

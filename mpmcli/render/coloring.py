@@ -212,7 +212,7 @@ def color_map(name: str | None, usual: str = SEQUENTIAL) -> str:
     if name not in mpl.colormaps:
         guess = nearest(name, list(mpl.colormaps))
         hint = f'did you mean "{guess}"?' if guess else "viridis, cividis, magma, coolwarm are some."
-        raise InputError(f'--cmap "{name}" is no colour map of matplotlib; {hint}')
+        raise InputError(f'--cmap "{name}" is not a colour map of matplotlib; {hint}')
     return name
 
 

@@ -29,10 +29,10 @@ def choose_frames(text: str, result: Result) -> list[int]:
     match = re.fullmatch(r"(-?\d+)?:(-?\d+)?(?::(-?\d+)?)?", word)
     start, end, step = (int(part) if part else None for part in match.groups()) if match else (0, 0, 0)
     if step == 0:
-        raise InputError(f'--frame "{text}" means no frame: {HINT}.')
+        raise InputError(f'--frame "{text}" selects no frame: {HINT}.')
     chosen = list(range(count))[start:end:step]
     if not chosen:
-        raise InputError(f"--frame {word} means no frame: {_holds(result)}.")
+        raise InputError(f"--frame {word} selects no frame: {_holds(result)}.")
     return chosen
 
 

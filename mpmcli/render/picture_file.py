@@ -125,7 +125,7 @@ def write_fault(path: Path, error: OSError) -> MpmcliError:
 def check_film(path: Path, fps: float) -> None:
     """Raise InputError for a file that is neither .mp4 nor .gif, or for a rate out of range."""
     if path.suffix.lower() not in (".mp4", ".gif"):
-        raise InputError(f"{path} would be no film: give a name that ends in .mp4 or .gif.")
+        raise InputError(f"{path} cannot be a film: give a name that ends in .mp4 or .gif.")
     if not (math.isfinite(fps) and FPS_MIN <= fps <= FPS_MAX):
         raise InputError(f"{fps:g} frames per second are not possible: give {FPS_MIN:g} to {FPS_MAX:g}.")
     if path.suffix.lower() == ".gif" and fps > GIF_FPS_MAX:
@@ -279,5 +279,5 @@ def _encode(contents: Iterator[bytes], form: Sequence[str], place: Path, name: P
     if status != 0:
         how = f"it was ended by signal {-status}" if status < 0 else f"its status is {status}"
         raise RunError(
-            f"ffmpeg failed to write {name}, {how}: {words.rstrip('.') or 'it said nothing'}; mpmcli doctor tries it."
+            f"ffmpeg failed to write {name}, {how}: {words.rstrip('.') or 'it gave no reason'}; mpmcli doctor tests it."
         )

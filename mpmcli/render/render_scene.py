@@ -130,7 +130,7 @@ def render_scene_of(result: Result) -> RenderScene:
     """Read the scene of a result from its header; InputError: it lacks the domain."""
     header, d = result.header, result.dimension
     if header.origin is None or not header.spacing:
-        raise InputError(f"{result.path} does not say what its domain is, so that no picture can be framed.")
+        raise InputError(f"{result.path} has no domain in its header, so that no picture can be framed.")
     bodies = header.bodies or (BodyHeader("all", {}, None, usual_particles_per_cell(d)),)
     names = tuple(one_line(body.name) for body in bodies)
     appearances, material_of = _materials(names, [body.material for body in bodies])

@@ -222,7 +222,7 @@ def plan_render(result: Result, request: Request, captions: tuple[str, ...] = ()
 
 def _require_sense(request: Request) -> None:
     if request.movie and request.montage:
-        raise InputError("--movie and --montage are two things: ask for one after the other.")
+        raise InputError("--movie and --montage exclude each other: give one of them.")
     if request.fps is not None and not request.movie:
         raise InputError("--fps is the rate of a film: name one with --movie.")
     if request.save_surface and request.mode != "surface":
@@ -235,7 +235,7 @@ def _require_sense(request: Request) -> None:
         allowed = COLORED if option == "--color-by" else (*COLORED, "density")
         if value and request.mode not in allowed:
             raise InputError(
-                f"{option} says nothing in --mode {request.mode}, which has colours of its own: use --mode "
+                f"{option} has no effect in --mode {request.mode}, which has its own colours: use --mode "
                 f"{' or '.join(allowed)}."
             )
 
@@ -245,10 +245,10 @@ def _paths(result: Result, request: Request, count: int) -> Callable[[int], Path
     output, mode = request.output, request.mode
     if output is not None and output.suffix and not output.is_dir():
         if output.suffix.lower() in (".mp4", ".gif"):
-            raise InputError(f"-o {output} would be no picture: for a film, give --movie.")
+            raise InputError(f"-o {output} cannot be a picture: for a film, give --movie.")
         if output.suffix.lower() != ".png":
             hint = "pictures are .png, and a directory with a dot has to be there"
-            raise InputError(f"-o {output} would be no picture: {hint}.")
+            raise InputError(f"-o {output} cannot be a picture: {hint}.")
         if count > 1 and not request.montage:
             raise InputError(f"-o {output} is one picture and {count} were asked for: name a directory.")
         return lambda k: output

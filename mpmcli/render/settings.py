@@ -82,7 +82,7 @@ def parse_size(text: str) -> tuple[int, int | None]:
     """Read "1280x720", or "1280xauto" for a height that follows from the scene: None; InputError for anything else."""
     match = re.fullmatch(r"(\d{1,9})[xX](\d{1,9}|auto)", text.strip())
     if not match:
-        raise InputError(f'--size "{text}" is no size: give width and height in pixels, such as 1280x720 or 1280xauto.')
+        raise InputError(f'--size "{text}" is not a size: give width and height, such as 1280x720 or 1280xauto.')
     width, height = int(match[1]), None if match[2] == "auto" else int(match[2])
     require_possible(width, height or width, text)
     return width, height
@@ -113,7 +113,7 @@ def parse_limits(text: str) -> tuple[float, float]:
     except ValueError:
         low = high = math.nan
     if not (math.isfinite(low) and math.isfinite(high) and low < high):
-        raise InputError(f'--clim "{text}" is no range: give the lower and the upper limit, such as 0,2.5.')
+        raise InputError(f'--clim "{text}" is not a range: give the lower and the upper limit, such as 0,2.5.')
     if max(-low, high) > LIMIT_MAX or not high - low >= max(LIMIT_MIN, NARROWEST * max(abs(low), abs(high))):
         raise InputError(f'--clim "{text}" is too wide or too narrow for colours: give limits such as 0,2.5.')
     return low, high

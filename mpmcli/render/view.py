@@ -192,14 +192,14 @@ def _free_view(scene: RenderScene, camera: str, size: tuple[int, int]) -> View:
         numbers = np.empty(0)
     what = f'--camera "{camera}" is not a camera: give {", ".join(CAMERAS)}, or six numbers x,y,z,x,y,z in metres'
     if len(numbers) != 6 or not np.isfinite(numbers).all():
-        raise InputError(f"{what}, where it stands and what it looks at.")
+        raise InputError(f"{what}, its position and its target.")
     low, high = np.array(scene.lower), np.array(scene.upper)
     if np.abs(numbers.reshape(2, 3) - 0.5 * (low + high)).max() > FARTHEST * (high - low).max():
         raise InputError(f"{what}: this one is too far from the domain for anything to be seen.")
     position, focus = numbers[:3], numbers[3:]
     back, up = position - focus, np.array(scene.up)
     if np.linalg.norm(back) <= 1e-9 * max(np.abs(numbers).max(), 1e-300):
-        raise InputError(f"{what}: this one looks at where it stands.")
+        raise InputError(f"{what}: its position and its target are equal.")
     if np.linalg.norm(np.cross(back, up)) <= 1e-6 * np.linalg.norm(back):
         # For a vertical line of sight any other direction serves as the upward one.
         up = np.eye(3)[(int(np.argmax(np.abs(up))) + 1) % 3]

@@ -56,7 +56,7 @@ def emitter_problems(scene: Scene) -> Iterator[Problem]:
         places, origin, upper = mouth.places, np.array(scene.domain.origin), np.array(scene.domain.upper)
         beyond = np.maximum(origin - places, places - upper).max(axis=0)
         for axis in np.flatnonzero(beyond > _TOLERANCE * scene.domain.spacing):
-            said = f'the mouth of "{emitter.name}" reaches out of the domain along {AXES[axis]} by {beyond[axis]:.6g} m'
+            said = f'the mouth of "{emitter.name}" extends beyond the domain along {AXES[axis]} by {beyond[axis]:.6g} m'
             yield Problem((*where, "shape"), said + "; move it or enlarge the domain")
         yield from (Problem((*where, "shape"), said) for said in _in_the_way(emitter, places, scene))
         if emitter.start >= scene.time.end:
@@ -71,7 +71,7 @@ def emitter_problems(scene: Scene) -> Iterator[Problem]:
     found = [("emitters",)] * bool(scene.emitters) + [("domain", "walls")] * opens
     if scene.solver.solids == "total" and found:
         what = "emitters" if scene.emitters else "open faces"
-        said = f'solver.solids = "total" knows no {what}: give solids = "updated", or leave them out'
+        said = f'solver.solids = "total" supports no {what}: give solids = "updated", or leave them out'
         yield Problem(found[0], said)
 
 
@@ -135,7 +135,7 @@ def gravity_problems(scene: Scene) -> Iterator[Problem]:
 def collider_problems(scene: Scene) -> Iterator[Problem]:
     """Find colliders that share a name, overlap bodies, lie outside the domain, or jump."""
     if scene.colliders and scene.solver.solids == "total":
-        said = '"total" knows walls only, and the scene has colliders: give solids = "updated"'
+        said = '"total" supports walls only, and the scene has colliders: give solids = "updated"'
         yield Problem(("solver", "solids"), said)
     first: dict[str, int] = {}
     placed = True
@@ -358,7 +358,7 @@ def _pushed(scene: Scene) -> Iterator[Problem]:
         solid = any(one.free and one.name == force.body for one in scene.colliders)
         if force.force is not None and force.body in names and not found and not solid:
             yield Problem(
-                ("forces", k, "force"), f'"{force.body}" flows in, and has no mass at the start; give acceleration'
+                ("forces", k, "force"), f'"{force.body}" is an emitter, and has no mass at the start; give acceleration'
             )
         if force.region is not None and solid:
             yield Problem(
@@ -436,8 +436,8 @@ def _nearly_held(body: Body, index: int, scene: Scene) -> Iterator[Problem]:
         for side, word, gap in zip(("min", "max"), pair, gaps, strict=True):
             if word != "separate" and _TOLERANCE * h < gap < _CLEAR * h:
                 said = (
-                    f'body "{body.name}" begins {gap:.4g} m from the wall {AXES[k]}_{side}, which never lets go; with '
-                    f'solver.solids = "total" it must touch it, or begin {_CLEAR * h:.4g} m away, or the wall be '
+                    f'body "{body.name}" begins {gap:.4g} m from the wall {AXES[k]}_{side}, which does not separate; '
+                    f'with solver.solids = "total" it must touch it, or begin {_CLEAR * h:.4g} m away, or the wall be '
                     '"separate"'
                 )
                 yield Problem(("bodies", index, "shape"), said)

@@ -137,7 +137,7 @@ def definitions(table: object, dimension: int | None) -> tuple[dict[str, ast.exp
     quantities = [name for name in QUANTITIES if dimension != 2 or name not in (POSITION[2], INITIAL[2])]
     for name, value in table.items() if isinstance(table, Mapping) else ():
         if not _NAME.fullmatch(name):
-            faults[name] = "is no name for an expression; use letters, digits and _, and begin with a letter"
+            faults[name] = "is not a valid name in an expression; use letters, digits and _, and begin with a letter"
         elif name in QUANTITIES or name in CONSTANTS or name in FUNCTIONS or iskeyword(name):
             faults[name] = "has a meaning in every expression already; take another name"
         else:

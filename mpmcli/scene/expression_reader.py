@@ -66,9 +66,9 @@ def parse(
     except SyntaxError as error:
         near = source[max(0, (error.offset or 1) - 1) :][:12].strip()
         place = f' near "{near}"' if near else " at its end"
-        raise ExpressionError(f'is no expression: "{_cut(source)}" cannot be read{place}') from None
+        raise ExpressionError(f'is not an expression: "{_cut(source)}" cannot be read{place}') from None
     except (ValueError, RecursionError, MemoryError):
-        raise ExpressionError("is no expression: it cannot be read") from None
+        raise ExpressionError("is not an expression: it cannot be read") from None
     expanded = text
     used = Counter(node.id for node in ast.walk(parsed) if isinstance(node, ast.Name) and node.id in constants)
     for name in used:
@@ -175,7 +175,7 @@ class _Reader:
         operator = getattr(node, "op", None)
         instead = f"; {_INSTEAD[type(operator)]}" if type(operator) in _INSTEAD else ""
         raise ExpressionError(
-            f'cannot hold "{self._said(node)}"{instead or "; it takes numbers, names, + - * / ** %, comparisons, "}'
+            f'cannot contain "{self._said(node)}"{instead or "; it takes numbers, names, + - * / ** %, comparisons, "}'
             f"{'' if instead else '`a if c else b` and functions'}"
         )
 
@@ -197,7 +197,7 @@ class _Reader:
         if name in self.names:
             return Name(name)
         if name in FUNCTIONS:
-            raise ExpressionError(f'needs what "{name}" is to be taken of: {name}(...)')
+            raise ExpressionError(f'needs the argument of "{name}": {name}(...)')
         if {"z": "y", "Z": "Y"}.get(name) in self.names:
             raise ExpressionError(
                 f'has no "{name}" in a 2D scene; the names here are {listed(list(self.names), "and")}'
@@ -206,15 +206,15 @@ class _Reader:
 
     def _call(self, node: ast.Call, depth: int) -> Tree:
         if not isinstance(node.func, ast.Name):
-            raise ExpressionError(f'cannot hold "{self._said(node)}"; a function is called by its name')
+            raise ExpressionError(f'cannot contain "{self._said(node)}"; a function is called by its name')
         name = node.func.id
         if name not in FUNCTIONS:
             if name in CONSTANTS or name in self.names:
-                raise ExpressionError(f'takes "{name}" for a function, and it is none; a product is written with *')
+                raise ExpressionError(f'takes "{name}" for a function, which it is not; a product is written with *')
             raise ExpressionError(_unknown("function", name, FUNCTIONS, tuple(FUNCTIONS)))
         function = FUNCTIONS[name]
         if node.keywords or any(isinstance(a, ast.Starred) for a in node.args):
-            raise ExpressionError(f'cannot hold "{self._said(node)}"; arguments are numbers in their order')
+            raise ExpressionError(f'cannot contain "{self._said(node)}"; arguments are numbers in their order')
         count = len(node.args)
         if not function.least <= count <= function.most:
             need = f"{function.least}" if function.least == function.most else f"at least {function.least}"

@@ -213,7 +213,7 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
     try:
         found = read_geometry(path)
     except GeometryFileError as error:
-        raise GeometryFileError(str(error) or "it is no mesh that can be read (STL, OBJ, PLY and VTU are)") from None
+        raise GeometryFileError(str(error) or "it is not a readable mesh (STL, OBJ, PLY and VTU are)") from None
     if not len(found.triangles):
         raise GeometryFileError("it holds no triangle")
     if not np.isfinite(found.vertices[np.unique(found.triangles)]).all():

@@ -207,7 +207,7 @@ def _csv(path: Path) -> dict[str, np.ndarray]:
             names = [name.strip() for name in next(rows, [])]
             lines = [(rows.line_num, row) for row in rows if row]
     except (UnicodeDecodeError, csv.Error, OSError):
-        raise GeometryFileError("it is no text with comma-separated values") from None
+        raise GeometryFileError("it is not text with comma-separated values") from None
     if not names or any(_is_number(name) for name in names):
         raise GeometryFileError("its first line must name the columns, such as x,y,z")
     for line, row in lines:
@@ -223,7 +223,7 @@ def _npy(path: Path, d: int) -> dict[str, np.ndarray]:
         found = np.load(path, mmap_mode="r", allow_pickle=False)
     # Python's tokenizer and parser raise almost any exception at a damaged header.
     except Exception:
-        raise GeometryFileError("it is no array of numpy") from None
+        raise GeometryFileError("it is not a numpy array") from None
     if found.dtype.names:
         return {name: found[name].reshape(-1).astype(np.float64) for name in found.dtype.names}
     if found.ndim != 2 or found.shape[1] not in (d, 2 * d) or found.dtype.kind not in "fiu":
@@ -237,7 +237,7 @@ def _data_set(path: Path, d: int, velocity: str | None) -> tuple[np.ndarray, np.
     try:
         found = read_geometry(path)
     except GeometryFileError:
-        raise GeometryFileError("it is no file of points that can be read (CSV, NPY, PLY and VTU are)") from None
+        raise GeometryFileError("it is not a readable file of points (CSV, NPY, PLY and VTU are)") from None
     if not len(found.points):
         raise GeometryFileError("it holds no point")
     position = _in_plane(found.points, d, "points")

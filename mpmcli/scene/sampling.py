@@ -188,7 +188,7 @@ def initial_faults(body: Body, position: np.ndarray, domain: Domain) -> Iterator
         load = hydrostatic_load(body, position, domain)
         where = _first(~np.isfinite(body.material.volume_ratio_under(load)), position)
         if where:
-            said = f"asks for {load.max():.4g} Pa, more than the material can press with; give it a larger bulk_modulus"
+            said = f"requires {load.max():.4g} Pa, more than the material can bear; give it a larger bulk_modulus"
             yield ("initial_pressure",), said
 
 

@@ -45,7 +45,7 @@ _POSITION = re.compile(r" \(at (?:line (\d+), column (\d+)|end of document)\)$")
 # Messages of tomllib, and the plainer sentences that replace them.
 _SYNTAX = {
     "Cannot overwrite a value": "this key is given twice",
-    "Invalid value": "this is no TOML value; text needs quotes, numbers and lists none",
+    "Invalid value": "this is not a TOML value; text needs quotes, numbers and lists none",
     "Expected '=' after a key in a key/value pair": "expected key = value",
     "Invalid initial character for a key part": "expected a key; a table in { } stands on one line",
     "Unclosed array": "a list is not closed with ]",
@@ -77,7 +77,7 @@ def read_toml(path: str | PathLike[str], kind: str = "scene") -> tuple[str, dict
         raise InputError(f"{file}: this is a directory; {hint}") from None
     except UnicodeDecodeError as error:
         raise InputError(
-            f"{file}: this is no text in UTF-8 (byte {error.start} is {error.object[error.start]:#04x}); "
+            f"{file}: this is not text in UTF-8 (byte {error.start} is {error.object[error.start]:#04x}); "
             f"give a {kind} in TOML"
         ) from None
     except (OSError, ValueError) as error:
@@ -250,7 +250,7 @@ def apply_overrides(data: dict[str, Any], overrides: Sequence[str]) -> tuple[dic
 def key_parts(key: str) -> list[str]:
     """Return the parts of a key as `apply_overrides` takes it, indices as text, or raise an InputError."""
     if not _PATH.fullmatch(key):
-        raise InputError(f'"{key}" is no key; a key is a path such as time.end or bodies[0].velocity')
+        raise InputError(f'"{key}" is not a key; a key is a path such as time.end or bodies[0].velocity')
     parts = [index or name.strip() for index, name in _PART.findall(key)]
     if len(parts) > MOST_NESTED:
         raise InputError(f'"{key[:40]}..." has {len(parts)} parts, and no value of a scene lies so deep')
@@ -265,7 +265,7 @@ def _value_of(text: str) -> object:
     except (ValueError, RecursionError):
         if _BARE_WORD.fullmatch(text):
             return text
-    raise InputError(f"{text or 'nothing'} is no TOML value; write a number, a list or a word, or text in quotes")
+    raise InputError(f"{text or 'nothing'} is not a TOML value; write a number, a list or a word, or text in quotes")
 
 
 def set_value(data: dict[str, Any], parts: list[str], value: object) -> Path:

@@ -20,7 +20,7 @@ WHY = {
     "speed": "a particle must not move more than half a cell in a step",
     "deformation": "a particle must not be compressed by more than half in a step",
     "collider": "a collider must not move more than half a cell in a step",
-    "force": "a force must not change by itself within a step, as the particle that it pushes moves on",
+    "force": "a force on a moving particle must not change by its own size within a step",
     "maximum": "time.step in the scene sets it",
     "forced": "time.step in the scene sets it, above what is stable, as --force allows",
 }
