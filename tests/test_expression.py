@@ -177,7 +177,7 @@ FAULTS = {
     "2 * (x > 1)": 'needs a number where "x > 1" is true or false; write 1 if x > 1 else 0',
     "1 if x else 2": 'needs a comparison where "x" is a number; compare it, with > 0 say',
     "x and y": 'needs a comparison where "x" is a number; compare it, with > 0 say',
-    "sin": 'needs what "sin" is to be taken of: sin(...)',
+    "sin": 'needs the argument of "sin": sin(...)',
     "sin(x, y)": 'needs 1 argument in "sin(x, y)"; found 2',
     "min(x)": 'needs at least 2 arguments in "min(x)"; found 1',
     "2 pi": 'is not an expression: "2 pi" cannot be read near ',
