@@ -116,7 +116,7 @@ class Forecast:
     compile_seconds: float | None
     step_seconds: float | None
     measured: bool
-    # All fields on the device; a frame and what it is made of, or the initial state; the packed file without
+    # All fields on the device; a frame and its sources, or the initial state; the packed file without
     # compression; the series of --format vtk.
     device_bytes: int
     host_bytes: int

@@ -349,10 +349,10 @@ class SweepTable(Table):
 
     base: Annotated[str, Field(description="The base scene, a TOML file beside the sweep.")]
     count: Annotated[Integer, Field(ge=1, le=10**9, description="Number of trajectories.")]
-    seed: Annotated[Integer, Field(ge=0, le=2**63 - 1, description="Seed of everything that is drawn.")] = 0
-    method: Annotated[Method, Field(description="How continuous distributions of [vary] are drawn.")] = "random"
+    seed: Annotated[Integer, Field(ge=0, le=2**63 - 1, description="Seed of all draws.")] = 0
+    method: Annotated[Method, Field(description="Sampling method of continuous distributions of [vary].")] = "random"
     accept: Annotated[Accepted, Field(description="The worst verdict of a trajectory of the dataset.")] = "stable"
-    vary: Annotated[dict[str, Drawn], Field(description="Keys of the base scene and what they are drawn from.")] = {}  # noqa: RUF012
+    vary: Annotated[dict[str, Drawn], Field(description="Keys of the base scene and their distributions.")] = {}  # noqa: RUF012
     place: Annotated[tuple[Placement, ...], Field(description="Bodies and colliders placed at random.")] = ()
     split: Annotated[Split, Field(description="Fractions of the trajectories by their purpose.")] = Split(
         train=0.8, valid=0.1, test=0.1

@@ -16,7 +16,7 @@ except ImportError:  # Windows
     resource = None
 
 TEMPORARY_SUFFIX = ".tmp"
-# Bytes left free on top of what is about to be written: file system metadata and other programs.
+# Bytes left free in addition to the data to be written: file system metadata and other programs.
 SPACE_MARGIN = 16 * 1024 * 1024
 # Error codes of the system for a lack of space.
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)

@@ -29,7 +29,7 @@ class Settings:
 
     mode: Mode
     color: str | None  # as `--color-by`; None for the default of dots, and for natural colours of materials
-    # Of the whole picture, pixels; None for a size, or a height, that follows from the scene.
+    # Size of the whole picture, pixels; None for a size, or a height, that follows from the scene.
     size: tuple[int, int | None] | None
     camera: str = "iso"
     theme: str = "light"

@@ -142,7 +142,7 @@ class Collider(Table):
     name: str = Field(pattern=NAME, description="Name of the collider, for messages and --set.")
     shape: OneColliderShape = Field(description="Shape: a form, as of bodies, or a plane.")
     side: Literal["outside", "inside"] = Field(
-        "outside", description="Where the material is: outside of the shape, or inside, as in a container."
+        "outside", description="Side of the material: outside the shape, or inside, as in a container."
     )
     wall: SurfaceWord = Field(
         "separate",
@@ -173,8 +173,8 @@ class Collider(Table):
     )
     density: Positive | None = Field(
         None,
-        description="Density, kg/m^3, of one that moves freely: velocity and angular_velocity are those at the start. "
-        "Default: it moves as the scene says.",
+        description="Density, kg/m^3, of a free collider, whose velocity and angular_velocity are initial values. "
+        "Default: prescribed motion.",
     )
     mass: Positive | None = Field(
         None, description="Mass, kg (2D: per metre of depth), in place of the density. Default: that of the density."

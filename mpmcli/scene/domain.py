@@ -78,14 +78,14 @@ class Faces(Table):
 
 
 class WallVelocity(Faces):
-    """Velocity of each face that moves along itself: one that sticks, or that has friction."""
+    """Tangential velocity of each face that sticks or has friction."""
 
-    x_min: Velocity | None = Field(None, description="Of the lower face along x, m/s.")
-    x_max: Velocity | None = Field(None, description="Of the upper face along x, m/s.")
-    y_min: Velocity | None = Field(None, description="Of the lower face along y, m/s.")
-    y_max: Velocity | None = Field(None, description="Of the upper face along y, m/s.")
-    z_min: Velocity | None = Field(None, description="Of the lower face along z, m/s; 3D only.")
-    z_max: Velocity | None = Field(None, description="Of the upper face along z, m/s; 3D only.")
+    x_min: Velocity | None = Field(None, description="Velocity of the lower face along x, m/s.")
+    x_max: Velocity | None = Field(None, description="Velocity of the upper face along x, m/s.")
+    y_min: Velocity | None = Field(None, description="Velocity of the lower face along y, m/s.")
+    y_max: Velocity | None = Field(None, description="Velocity of the upper face along y, m/s.")
+    z_min: Velocity | None = Field(None, description="Velocity of the lower face along z, m/s; 3D only.")
+    z_max: Velocity | None = Field(None, description="Velocity of the upper face along z, m/s; 3D only.")
 
 
 def require_grip(velocity: WallVelocity, words: Mapping[str, str], frictions: Mapping[str, float]) -> None:
@@ -222,7 +222,7 @@ class Domain(Table):
         json_schema_extra=_or_table({"type": "number", "minimum": 0}, 0),
     )
     wall_velocity: WallVelocity | None = Field(
-        None, description="Velocity along themselves of walls that stick or have friction, m/s."
+        None, description="Tangential velocity of walls that stick or have friction, m/s."
     )
 
     @field_validator("size")

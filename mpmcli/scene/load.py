@@ -80,7 +80,7 @@ class LoadedScene:
 
     Attributes:
         scene: the scene, with no "auto" left in its materials.
-        notes: one sentence for every choice, each beginning with the name of its body.
+        notes: one sentence per choice, each beginning with the name of its body.
         source: the file it came from, as it was given.
     """
 
@@ -98,7 +98,7 @@ def load_scene(path: str | PathLike[str], overrides: Sequence[str] = (), *, laws
         laws: parameter models of the constitutive laws that a material may follow.
 
     Raises:
-        InputError: one line per fault: `FILE:LINE: KEY PATH: what is wrong and what would be right`.
+        InputError: one line per fault: `FILE:LINE: KEY PATH: fault and correction`.
     """
     text, data = read_scene(path)
     directory = File(path).parent
@@ -160,7 +160,7 @@ def _validate(
 ) -> tuple[Scene | None, list[Problem], dict[tuple[str, int], list[str]]]:
     """Expand and validate until no key is unknown, so that a misspelled key does not hide other faults.
 
-    Returns the scene, what is wrong with it at the user's own paths, and what the knobs of each body did.
+    Returns the scene, its problems at the user's own paths, and the effects of the knobs of each body.
     """
     model = scene_model(laws)
     problems: list[Problem] = []

@@ -56,7 +56,7 @@ def parts_of(tree: Tree, start: float, end: float, *, precise: bool = True) -> P
     count, whole = 0, 0.0
     for depth in range(DEPTH):
         middle = low + CUT * (high - low)
-        # Of each part, and of its halves.
+        # Integrals of each part, and of its halves.
         values, first, second = _values(tree, (low, low, middle), (high, middle, high))
         least, most = (np.broadcast_to(side, low.shape) for side in bounds_of(tree, {"t": (low, high)}))
         width = np.where(np.isfinite(most - least), most - least, np.inf)

@@ -100,5 +100,5 @@ def direction_as(example: str) -> Any:
     return Annotated[Vector, AfterValidator(check)]
 
 
-# Of an axis in 3D.
+# Direction of an axis in 3D.
 Axis = direction_as("[0, 0, 1] has")

@@ -38,7 +38,7 @@ _SPLINES = {d: _products(d) for d in (2, 3)}
 
 
 def relaxed(position: np.ndarray, volume: float, form: Form, domain: Domain) -> np.ndarray:
-    """Return particles of a form, (n, d), m, moved such that full nodes have the volume h^d, and no first moment.
+    """Return particles of a form, (n, d), m, moved so that full nodes have the volume h^d and no first moment.
 
     A node is full if the form, with its images behind walls and beyond periodic faces, fills its quadratic spline. The
     method is gradient descent with momentum on the squared deficits of full nodes. Only particles within reach of a

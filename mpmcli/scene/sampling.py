@@ -395,7 +395,7 @@ def _sample(body: Body, index: int, domain: Domain) -> BodyParticles:
     volume = form.volume / len(position)
     if body.relaxed:
         position = relaxed(position, volume, form, domain)
-    # A body too large to be looked at when the scene was loaded.
+    # A body too large to be examined when the scene was loaded.
     faults = [f"{path_text(('bodies', index, *key))}: {said}" for key, said in initial_faults(body, position, domain)]
     if faults:
         raise InputError("\n".join(faults))

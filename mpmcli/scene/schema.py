@@ -143,7 +143,7 @@ class SolverSettings(Table):
     transfer: Literal["apic", "aflip"] = Field(
         "apic",
         description='Quantities transferred to the nodes and back. "apic": velocity and its gradient, which '
-        'keeps angular momentum exactly. "aflip": APIC that damps only a share of what the grid does not see: waves, '
+        'keeps angular momentum exactly. "aflip": APIC that damps only a share of the motion not on the grid: waves, '
         "splashes and spin lose far less; twice the memory of the grid, and some noise.",
     )
     flip: Annotated[
@@ -152,8 +152,8 @@ class SolverSettings(Table):
             strict=True,
             ge=0,
             le=1,
-            description='With transfer = "aflip": share of what the grid does not see of a particle\'s motion that it '
-            f"keeps in a step of its own. 0 is APIC, 1 damps nothing. Default: {USUAL_FLIP:g}.",
+            description='With transfer = "aflip": share of the part of a particle\'s motion that is not on the grid '
+            f"and that a step keeps. 0 is APIC, 1 damps nothing. Default: {USUAL_FLIP:g}.",
         ),
         AfterValidator(_only_with_aflip),
         Field(validate_default=True),
