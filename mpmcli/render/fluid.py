@@ -34,7 +34,7 @@ SAMPLES = 2  # samples along each axis of a pixel in VTK's pictures
 HEAD_ON = 0.02  # reflectance of water at normal incidence: ((n - 1) / (n + 1))^2, n = 1.33
 SKIN = 0.05  # a skin of this thickness, in lengths of the scene, is added to every liquid, so that films are visible
 RIM = 0.35  # light from behind is lost at the rim, where it would leave at a grazing angle
-LINEAR = (np.arange(256, dtype=np.float32) / 255) ** np.float32(2.2)  # gamma of displayed values
+LINEAR = (np.arange(256, dtype=np.float32) / 255) ** np.float32(2.2)  # displayed values in linear light
 
 
 class FluidPainter:
@@ -191,9 +191,7 @@ class Optics:
     depths: float  # optical depth (natural logarithm) of the most absorbed colour over the length of the scene
     milk: float  # optical depth of scattering, equal for all colours
     body: float  # fraction of the scattered light that returns
-    deepening: (
-        float  # exponent of the transmitted fraction that colours the scattered light, which travels through the liquid
-    )
+    deepening: float  # exponent of the transmitted fraction that tints the scattered light
     gloss: float  # strength of highlights
     sharpness: float  # exponent of the highlight
     reflection: float  # fraction of the mirror image that is kept; 0 is dull

@@ -56,7 +56,7 @@ class OffscreenRenderer:
         )
 
     def add_light(self) -> None:
-        """Add a light from behind the left of the camera."""
+        """Add a light above and to the left of the camera."""
         import pyvista as pv
 
         light = pv.Light(light_type="camera light", intensity=1.0)

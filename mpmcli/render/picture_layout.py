@@ -72,8 +72,8 @@ class PictureLayout:
     ) -> np.ndarray:
         """Return the whole picture (height, width, 3) uint8 from pictures of the scene, row by row, and their times, s.
 
-        A legend states the number of `missing` particles, whose value is not a number. The captions, or else the times,
-        are above each picture of a montage, shortened if too long.
+        With `missing` particles, whose value is not a number, the colour bar has an entry for them. The captions, or
+        else the times, are above each picture of a montage, shortened if too long.
         """
         from PIL import Image, ImageDraw
 
