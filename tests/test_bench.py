@@ -280,8 +280,8 @@ def test_a_parameter_that_must_be_given_is_taken_from_its_knob() -> None:
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["--threads", "0"], "invalid value for '--threads': 0 is no number of threads; give 2, or 1,2"),
-        (["--threads", "1,x"], "invalid value for '--threads': 1,x is no number of threads"),
+        (["--threads", "0"], "invalid value for '--threads': 0 is not a number of threads; give 2, or 1,2"),
+        (["--threads", "1,x"], "invalid value for '--threads': 1,x is not a number of threads"),
         (["--dataset", "--profile"], "--dataset has one scene and one table"),
         (["--dataset", "--case", "2d-64"], "--dataset has one scene and one table"),
         (["--profile", "--threads", "1,2"], "--dataset and --profile take one number of threads: give --threads 1."),

@@ -99,9 +99,9 @@ def test_every_fault_is_told_at_once(tmp_path, monkeypatch):
 # Arguments after `simulate scene.toml`, and what the sentence says.
 OPTIONS = {
     "no value": (["--set", "time.end"], "--set time.end: an override is KEY=VALUE"),
-    "no key": (["--set", "=3"], '--set =3: "" is no key'),
+    "no key": (["--set", "=3"], '--set =3: "" is not a key'),
     "unknown key": (["--set", "time.ende=3"], '--set time.ende=3: time.ende: unknown key; did you mean "end"?'),
-    "no TOML": (["--set", "time.end=[1"], "--set time.end=[1: [1 is no TOML value"),
+    "not a TOML": (["--set", "time.end=[1"], "--set time.end=[1: [1 is not a TOML value"),
     "no entry": (["--set", "bodies[3].name=a"], "--set bodies[3].name=a: bodies has 1 entry, counted from 0"),
     "unknown arch": (["--arch", "gpu"], "invalid value for '--arch': 'gpu' is not one of 'auto', 'cpu'"),
     "no threads": (["--threads", "0"], "invalid value for '--threads': 0 is not in the range x>=1"),

@@ -143,7 +143,7 @@ def test_what_cannot_be_read_is_said_in_a_sentence(tmp_path):
     refused(path, "has format 3")
     with h5py.File(shard, "w"):
         pass
-    refused(path, "no shard")
+    refused(path, "not a shard")
     shard.unlink()
     with pytest.raises(InputError, match="is missing"):
         dataset[1]

@@ -145,7 +145,7 @@ BAD = [
      'emitters[0].shape: the mouth of "jet" could hold 2e+11 particles at once, and 1e+07 is the most; '
      "make it narrower, or the grid coarser"),
     ("[2.0, 1.5], max = [2.2, 1.6]", "[3.9, 1.5], max = [4.5, 1.6]",
-     'emitters[0].shape: the mouth of "jet" reaches out of the domain along x by 0.495 m; move it or enlarge the '
+     'emitters[0].shape: the mouth of "jet" extends beyond the domain along x by 0.495 m; move it or enlarge the '
      "domain"),
     ("[2.0, 1.5], max = [2.2, 1.6]", "[0.5, 0.1], max = [0.9, 0.3]",
      'emitters[0].shape: the mouth of "jet" lies in body "column", for example at [0.505, 0.2]; move one of them'),
@@ -176,5 +176,5 @@ def test_each_bad_one_has_its_sentence(tmp_path, monkeypatch, good, bad, line):
 
 def test_solids_on_grids_of_their_own_know_neither():
     tables = jet_scene().model_dump(exclude_none=True, exclude={"domain": {"cells"}})
-    with pytest.raises(InputError, match='solids = "total" knows no emitters'):
+    with pytest.raises(InputError, match='solids = "total" supports no emitters'):
         scene_of(**tables | {"solver": {"solids": "total"}})

@@ -270,6 +270,6 @@ def test_a_file_may_hold_only_those_that_are_there(
         assert frame.position.tobytes() == whole.position[there].tobytes()
         assert result.ledger[k].mass == row.mass
     refused = run_here("export", "out", "--to", "npz", "-o", "npz")
-    assert refused.status == 2 and "holds only the particles that are there" in refused.stderr
+    assert refused.status == 2 and "holds only the particles present" in refused.stderr
     drawn = run_here("render", "out", "--mode", "density", "-o", "picture.png")
     assert drawn.status == 2 and "density needs all of them" in drawn.stderr

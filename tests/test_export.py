@@ -197,7 +197,7 @@ def test_fast_particles_of_periodic_domains(tmp_path):
 
 def test_gns_takes_no_periodic_domain(tmp_path):
     path = write_dataset(tmp_path / "set", [made_trajectory(0, periodic="y")])
-    assert "periodic faces, which GNS does not know" in refused(path, "gns", tmp_path / "out")
+    assert "periodic faces, which GNS does not support" in refused(path, "gns", tmp_path / "out")
 
 
 def test_periodic_domains_that_differ_are_refused(tmp_path):

@@ -122,7 +122,7 @@ def test_the_same_pictures_give_the_same_bytes(pictures, tmp_path, end):
 @pytest.mark.parametrize(
     ("name", "fps", "sentence"),
     [
-        ("film.avi", 24, r"film.avi would be no film: give a name that ends in .mp4 or .gif"),
+        ("film.avi", 24, r"film.avi cannot be a film: give a name that ends in .mp4 or .gif"),
         ("film.mp4", 0, r"0 frames per second are not possible"),
         ("film.mp4", float("nan"), r"nan frames per second are not possible"),
         ("film.gif", 60, r"film.gif cannot show 60 frames per second, as a gif has 50 at most"),
@@ -179,8 +179,8 @@ def test_without_ffmpeg_one_sentence_says_so(pictures, tmp_path, monkeypatch):
     ("script", "sentence"),
     [
         ("echo 'the encoder is not there' >&2; exit 3", "film.mp4, its status is 3: the encoder is not there"),
-        ("cat > /dev/null; exit 1", "film.mp4, its status is 1: it said nothing"),
-        ("kill -9 $$", "film.mp4, it was ended by signal 9: it said nothing"),
+        ("cat > /dev/null; exit 1", "film.mp4, its status is 1: it gave no reason"),
+        ("kill -9 $$", "film.mp4, it was ended by signal 9: it gave no reason"),
         # SIGXFSZ, and the exit status that ffmpeg has after ENOSPC.
         ("kill -25 $$", r"film.mp4 could not be written \(File too large\)"),
         ("exit 228", r"film.mp4 could not be written \(No space left on device\)"),

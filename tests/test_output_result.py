@@ -49,7 +49,7 @@ def test_a_file_that_contradicts_itself_is_damaged(tmp_path):
     fill(tmp_path / "run", [make_frame(0, 20, 3)])
     with changed(tmp_path / "run" / "particles.vtkhdf") as f:
         f["mpmcli"].attrs["header"] = "{no JSON"
-    with pytest.raises(InputError, match="is damaged: what it should hold cannot be read"):
+    with pytest.raises(InputError, match="is damaged: its content cannot be read"):
         open_result(tmp_path / "run")
     with h5py.File(tmp_path / "run" / "particles.vtkhdf", "r+") as f:
         del f["VTKHDF/Steps"]

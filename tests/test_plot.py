@@ -212,8 +212,8 @@ def test_a_file_that_it_did_not_make_is_replaced_only_when_asked_to(result, tmp_
     ("arguments", "sentence"),
     [
         (["nothing"], "error: nothing does not exist"),
-        (["result", "-o", "picture.jpg"], "error: picture.jpg would be no picture of this command: give a name that "),
-        (["result", "--size", "12"], 'error: --size "12" is no size: give width and height in pixels'),
+        (["result", "-o", "picture.jpg"], "error: picture.jpg cannot be a picture of this command: give a name that "),
+        (["result", "--size", "12"], 'error: --size "12" is not a size: give width and height, such as'),
         (
             ["result", "--size", "100x100"],
             "error: --size 100x100 is not possible: each side of this picture has 300 to 8000 pixels.",

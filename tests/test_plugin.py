@@ -226,7 +226,7 @@ def test_a_file_that_cannot_be_read_is_refused():
     Path("folder.py").mkdir()
     for path, sentence in {
         "nothing.py": "there is no such file; give a Python file that defines LAW",
-        "binary.py": "the file cannot be read: it is no text in UTF-8",
+        "binary.py": "the file cannot be read: it is not text in UTF-8",
         "folder.py": "the file cannot be read: Is a directory",
     }.items():
         assert refused("materials", "--plugin", path) == f"{path}: {sentence}"
@@ -241,7 +241,7 @@ def test_two_plugins_of_one_name_are_refused():
 def test_a_result_needs_no_plugin():
     Path("result").mkdir()
     assert refused("info", "result", "--plugin", "law.py") == (
-        "--plugin is for scenes, and result is none; leave it out."
+        "--plugin is for scenes, and result is not one; leave it out."
     )
 
 

@@ -34,7 +34,7 @@ def test_ranges_are_those_of_python(count: int, start: int | None, stop: int | N
     if expected:
         assert choose_frames(text, result(count)) == expected
     else:
-        with pytest.raises(InputError, match="means no frame"):
+        with pytest.raises(InputError, match="selects no frame"):
             choose_frames(text, result(count))
 
 

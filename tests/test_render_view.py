@@ -111,7 +111,7 @@ def test_a_camera_is_not_beyond_what_numbers_reach() -> None:
 
 
 def test_a_camera_needs_something_to_look_at() -> None:
-    with pytest.raises(InputError, match="looks at where it stands"):
+    with pytest.raises(InputError, match="position and its target are equal"):
         view_of(SUBJECT, "1,2,3,1,2,3", (320, 200))
     with pytest.raises(InputError, match="six numbers"):
         view_of(SUBJECT, "1,2,3,nan,2,3", (320, 200))

@@ -36,13 +36,13 @@ def test_sizes(text: str, size: float) -> None:
 
 @pytest.mark.parametrize("text", ["", "2", "h", "-2h", "0s", "1:30", "1:75:00", "2 hours", "nan", "1e400s", "2h x"])
 def test_what_is_no_time(text: str) -> None:
-    with pytest.raises(click.BadParameter, match=r"is no time; give 2h.*1:30:00"):
+    with pytest.raises(click.BadParameter, match=r"is not a time; give 2h.*1:30:00"):
         duration(text)
 
 
 @pytest.mark.parametrize("text", ["", "8", "GB", "-1GB", "0MB", "8 bytes", "1e9GB", "8GB8"])
 def test_what_is_no_size(text: str) -> None:
-    with pytest.raises(click.BadParameter, match=r"is no size; give 8GB"):
+    with pytest.raises(click.BadParameter, match=r"is not a size; give 8GB"):
         size_of(text)
 
 

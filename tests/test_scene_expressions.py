@@ -103,7 +103,7 @@ def test_hydrostatic_needs_gravity_that_it_can_balance(tmp_path):
     for gravity, said in {
         '["3 * sin(t)", -9.81]': "needs gravity that stays the same; domain.gravity depends on t",
         "[0, 0]": "needs gravity: give domain.gravity, or leave it out",
-        "[0, -1000]": "asks for 2.875e+05 Pa, more than the material can press with; give it a larger bulk_modulus",
+        "[0, -1000]": "requires 2.875e+05 Pa, more than the material can bear; give it a larger bulk_modulus",
     }.items():
         with pytest.raises(InputError) as error:
             loaded(tmp_path, f"domain.gravity={gravity}", text=text)

@@ -85,8 +85,8 @@ def test_a_misspelled_key_does_not_hide_what_only_the_whole_scene_shows():
 
 def test_missing_tables_and_no_bodies():
     assert refusal("") == [
-        "scene.toml: domain: missing key: the box that the scene lives in, and its grid",
-        "scene.toml: time: missing key: how long, how many frames, which steps",
+        "scene.toml: domain: missing key: the box of the scene, and its grid",
+        "scene.toml: time: missing key: simulated time, frames and time step",
     ]
     head = GOOD[: GOOD.index("[[bodies]]")]
     none = "bodies: needs at least one entry, or emitters that bring the material"
@@ -118,7 +118,7 @@ def test_files_that_are_no_scene():
         "nope.toml": "nope.toml: there is no such file; give the path of a scene in TOML",
         "directory": "directory: this is a directory; give the path of a scene in TOML",
         "result": "result: this is a directory; did you mean result/scene.toml?",
-        "binary": "binary: this is no text in UTF-8 (byte 8 is 0xff); give a scene in TOML",
+        "binary": "binary: this is not text in UTF-8 (byte 8 is 0xff); give a scene in TOML",
     }.items():
         with pytest.raises(InputError) as refused:
             load_scene(path, laws=parameter_models())
@@ -137,7 +137,7 @@ def test_a_scene_without_a_file_has_no_lines():
     with pytest.raises(InputError) as refused:
         parse_scene({"time": {"end": 1, "frames": 2}, "bodies": [3]}, laws=parameter_models(), source="case")
     assert str(refused.value).splitlines() == [
-        "case: domain: missing key: the box that the scene lives in, and its grid",
+        "case: domain: missing key: the box of the scene, and its grid",
         "case: bodies[0]: must be a table; found 3",
     ]
 

@@ -235,7 +235,7 @@ REPLACED = [
     (
         "spacing = 0.02",
         "spacing =",
-        "4:10: not valid TOML: this is no TOML value; text needs quotes, numbers and lists none",
+        "4:10: not valid TOML: this is not a TOML value; text needs quotes, numbers and lists none",
     ),
     (
         "box = { min",

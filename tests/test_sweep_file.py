@@ -227,7 +227,10 @@ def test_a_faulty_distribution_is_named(value, sentence):
             '"bodies.5.velocity" = [1, 0]',
             "bodies.5.velocity: bodies has 2 entries, counted from 0; there is no bodies[5]",
         ),
-        ('"time..end" = 1', 'time..end: "time..end" is no key; a key is a path such as time.end or bodies[0].velocity'),
+        (
+            '"time..end" = 1',
+            'time..end: "time..end" is not a key; a key is a path such as time.end or bodies[0].velocity',
+        ),
         (
             '"bodies.sand.name" = "a"',
             "bodies.sand.name: vary what a body, a collider or a force holds, such as bodies.NAME.velocity, "
@@ -363,7 +366,7 @@ def test_a_faulty_base_scene_speaks_for_itself():
         "base.toml:6: time.end: must be greater than 0; found -0.1"
     ]
     assert refusal(SWEEP, "a = ") == [
-        "base.toml:1: not valid TOML: this is no TOML value; text needs quotes, numbers and lists none"
+        "base.toml:1: not valid TOML: this is not a TOML value; text needs quotes, numbers and lists none"
     ]
 
 

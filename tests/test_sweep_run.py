@@ -360,7 +360,7 @@ def test_bad_input_has_one_sentence(truth: Path, tmp_path: Path, monkeypatch: py
     assert "another sweep, or of another count" in refused("-o", truth, "--resume", "--count", 11)
     assert "holds part 1/1 of the sweep" in refused("-o", truth, "--resume", "--shard", "1/2")
     assert "--shard 2/2 is empty: 12 trajectories fill 1 shard" in refused("-o", tmp_path / "d", "--shard", "2/2")
-    assert "3/2 is no part" in refused("-o", tmp_path / "d", "--shard", "3/2")
+    assert "3/2 is not a part" in refused("-o", tmp_path / "d", "--shard", "3/2")
     assert "exists and is not empty" in refused("-o", tmp_path)
     assert "no scheduler answers there" in refused("-o", tmp_path / "d", "--scheduler", "tcp://127.0.0.1:1")
     monkeypatch.setattr("mpmcli.dataset.sweep_run.shutil.disk_usage", lambda _: SimpleNamespace(free=5))

@@ -276,7 +276,7 @@ def test_threads_change_no_byte(backend_of: Callable) -> None:
         ),
         ({"bodies": [("body", {"law": "fluid", "density": 1e3, "bulk_modulus": 1e4})]}, "follows fluid"),
         ({"deformation": [[1.1, 0.0], [0.0, 1.0]]}, "must be left out with solver.solids"),
-        ({"low": 0.05}, "begins 0.05 m from the wall y_min, which never lets go"),
+        ({"low": 0.05}, "begins 0.05 m from the wall y_min, which does not separate"),
         ({"low": 0.3, "word": "stick"}, '"body" begins 0.3 m away, and would not stick to it later'),
     ],
 )

@@ -1,1 +1,1 @@
-"""`mpmcli check`: the check of a scene before it runs, and of a result after."""
+"""`mpmcli check`: checks a scene before its run, and a result after it."""

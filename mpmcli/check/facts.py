@@ -88,7 +88,7 @@ class SceneFacts:
         self.deformed = any(start.bound != StateBound() for start in self.starts)
         self.bounds: SceneBounds = reachable(scene, self.starts)
         self.limits: tuple[SceneLimit, ...] = tuple(scene_limits(scene, self.bounds, self.starts))
-        # Of two that are equal, the one at rest, which comes first.
+        # Of two equal limits, the one at rest, which comes first.
         self.binding = min(self.limits, key=lambda limit: limit.value)
         at_rest = (limit for limit in self.limits if limit.state == "rest")
         self.binding_at_start = min(at_rest, key=lambda limit: limit.value)
@@ -99,7 +99,7 @@ class SceneFacts:
     @cached_property
     def bodies(self) -> tuple[BodyFacts, ...]:
         """Quantities of each body, in the order of the scene."""
-        # Gravity that depends on time is taken at the start.
+        # Time-dependent gravity is evaluated at the start.
         down = np.nan_to_num(self.scene.domain.gravity_at(0.0))
         g = float(np.linalg.norm(down))
         facts = []
@@ -123,8 +123,8 @@ class SceneFacts:
     def step_expected(self) -> float:
         """Step of most of the run after the first contact, s: `step` where nothing stored or forced drives the scene.
 
-        What a start or a force can give to the fastest particle anywhere lasts a moment or does not happen: then the
-        bounds of motion count as at the start.
+        The largest speed that a start or a force can cause is brief or does not occur; the bounds of motion are then
+        those at the start.
         """
         if not self.scene.pushes and not self.deformed:
             return self.step
@@ -172,7 +172,7 @@ def arrivals(scene: Scene, fastest: float = 0.0, *, pressed: bool = False) -> li
         speeds = [speed for time, speed in falls if math.isfinite(time)]
         speeds += np.linalg.norm(relative[np.isfinite(times)], axis=1).tolist()
         ends = np.array([time for time, _ in falls] + times.tolist())
-        # What touches it from the start, such as a wall along which it flies, is no impact.
+        # A contact from the start, such as a wall along which it slides, is not an impact.
         later = np.where(ends > 0, ends, np.inf)
         first = int(np.argmin(later))
         impact = np.zeros(0)
@@ -185,7 +185,7 @@ def arrivals(scene: Scene, fastest: float = 0.0, *, pressed: bool = False) -> li
 
 
 def _fall(gap: float, speed: float, gravity: float, reach: float) -> tuple[float, float]:
-    """Return time, s, and speed at which a gap that closes is `reach`; of a smaller gap 0, and that where it closes."""
+    """Return time, s, and speed at which a closing gap is `reach`; for a smaller gap 0, and the speed at closure."""
     if math.isinf(gap):
         return math.inf, 0.0
     left = gap - reach

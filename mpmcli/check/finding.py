@@ -1,4 +1,4 @@
-"""Findings of a check: each states what is wrong, the number that shows it, and what to change."""
+"""Findings of a check: each states a fault, the number that shows it, and the change that removes it."""
 
 import re
 from collections.abc import Iterable
@@ -9,7 +9,7 @@ from mpmcli.plain_text import counted
 from mpmcli.scene.problem import quoted, several
 
 Severity = Literal["error", "warning", "note"]
-# Of a run; a check of its files finds the first three, the others stopped it.
+# Verdicts of a run; a check of its files finds the first three, the others stopped it.
 Verdict = Literal["stable", "suspect", "unstable", "escaped", "failed"]
 # Rules on what the transfers take.
 LOSSES = ("dissipation", "impact-loss", "numerical-viscosity")
@@ -31,7 +31,7 @@ class Finding:
 
     @property
     def line(self) -> str:
-        """The finding in one line: severity, what, and what to change."""
+        """The finding in one line: severity, fault and change."""
         return f"{self.severity}: {self.what} {self.fix}"
 
 

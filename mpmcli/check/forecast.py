@@ -1,4 +1,4 @@
-"""Forecast of the steps, time, memory and disk space of a run, by a probe or without, and the rules on the last two."""
+"""Forecast of steps, time, memory and disk space of a run, with or without a probe, and rules on the last two."""
 
 import math
 import shutil
@@ -44,9 +44,9 @@ FRAME_SECONDS = 0.0005
 DISK_BYTES_PER_SECOND = 4e8
 # A frame is written once as a segment, read, written into the packed file, and compared: four passes.
 DISK_PASSES = 4
-# More than this take hours to write.
+# More frames than this take hours to write.
 MOST_FRAMES = 100_000
-# While the frames are packed, two copies are on the disk.
+# During packing two copies are on the disk.
 COPIES = 2
 # Wall time of the steps that are counted, s.
 SECONDS = 2.0
@@ -56,7 +56,7 @@ WARM_UP = 3
 
 @dataclass(frozen=True)
 class Probe:
-    """Measured cost of a run's start: seconds to start, to compile, of a step (None: unstable before) and a frame."""
+    """Measured cost: seconds to start, to compile, of a step (None if the probe became unstable) and of a frame."""
 
     backend: Backend
     start_seconds: float
@@ -80,7 +80,7 @@ def probe_scene(loaded: LoadedScene, steps: int, *, threads: int | None = None) 
     run.begin()
     run.frame()
     first_frame = time.perf_counter() - began - started
-    # The smallest of three: the second frame allocates memory, later ones reuse it.
+    # The smallest of three: the second frame allocates memory, which later ones reuse.
     frame = min(repeat(run.frame, number=1, repeat=3))
     compiled = max(0.0, first_frame - frame)
     measured, spent, failure = 0, 0.0, ""
@@ -116,7 +116,7 @@ class Forecast:
     compile_seconds: float | None
     step_seconds: float | None
     measured: bool
-    # All fields on the device; a frame and what it is made of, or the initial state; the packed file without
+    # All fields on the device; a frame and its sources, or the initial state; the packed file without
     # compression; the series of --format vtk.
     device_bytes: int
     host_bytes: int
@@ -181,12 +181,12 @@ def expected_steps(facts: SceneFacts) -> int:
 
 
 def seconds_of_one(scene: Scene, steps: int) -> float:
-    """Return what one of many runs takes on one thread, s, by the table of costs."""
+    """Return the time of one of many runs on one thread, s, from the table of costs."""
     return steps * cost_of(scene, "most").step + scene.time.frames * FRAME_SECONDS
 
 
 def damped_step(facts: SceneFacts, body: BodyFacts, step: float, shorter: float = 1.0) -> float:
-    """Return the step (s) whose damping a body has in steps of `step`: its own if that is longer.
+    """Return the step (s) that determines the damping of a body in a run with `step`: its own if that is longer.
 
     shorter: ratio of its own step then to that at the start.
     """
@@ -194,7 +194,7 @@ def damped_step(facts: SceneFacts, body: BodyFacts, step: float, shorter: float 
 
 
 def wave_loss(thickness: float, spacing: float, step: float, settings: SolverSettings) -> float:
-    """Return the share of energy per second that the longest wave across a body loses at a step (s), 1/s.
+    """Return the fraction of energy per second that the longest wave across a body loses at a step (s), 1/s.
 
     Its wave number is k = pi / thickness. A step of a body's own length is damped (docs/theory.md, 2.4).
     """

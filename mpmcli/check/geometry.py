@@ -12,27 +12,26 @@ from mpmcli.scene.shapes import Ball, Box, Capsule, Composite, Cylinder, Form, M
 
 # Accuracy of the largest ball in a form, relative to the extent of the form, in 2D and 3D.
 RESOLUTION = {2: 1e-3, 3: 2e-2}
-# Cells along the longest axis of a mesh, at whose nodes the middle of its largest ball is sought.
+# Cells along the longest axis of a mesh, whose nodes are tried as the centre of its largest ball.
 CELLS = 48
 # Distance from a wall, in cells, below which a body touches it.
 TOUCHING = 1e-3
 # Alternating projections end when an iteration changes the distance by less than this fraction of it.
 SETTLED = 1e-6
 ROUNDS = 500
-# Of a search: points per axis that are tried at first, times that the cells around the best are halved, and how many of
-# them are.
+# Search: points per axis at the first level, number of halvings of the best cells, and number of those cells.
 TRIED, HALVINGS, KEPT = 16, 7, 500
 
 
 def spanned_axes(scene: Scene, form: Form) -> set[int]:
-    """Return the axes along which a box spans the domain between walls without "stick", as unbounded matter does."""
+    """Return the axes along which a box spans the domain between walls without "stick", like unbounded matter."""
     if not isinstance(form, Box):
         return set()
     return {a for a, faces in enumerate(touched_walls(scene, form)) if all(faces) and "stick" not in faces}
 
 
 def touched_walls(scene: Scene, form: Box) -> list[tuple[str, str]]:
-    """Return per axis the words for the walls that a box touches below and above it, "" where it does not."""
+    """Return for each axis the conditions of the lower and upper wall that a box touches, "" if it touches none."""
     domain, reach = scene.domain, TOUCHING * scene.domain.spacing
     return [
         (
@@ -44,10 +43,10 @@ def touched_walls(scene: Scene, form: Box) -> list[tuple[str, str]]:
 
 
 def thickness(form: Form, endless: Collection[int] = ()) -> float:
-    """Return the diameter of the largest ball that fits into a shape, m: its thinnest extent where it is convex.
+    """Return the diameter of the largest ball that fits into a shape, m: its smallest extent if it is convex.
 
-    Of a mesh to a few cells of a grid of 48; of a union, that of its parts where they overlap; of points, that of their
-    bounding box. The axes in `endless` are ignored for a box, unless all axes are in it.
+    The accuracy for a mesh is a few cells of a grid of 48. Overlapping parts of a union are measured separately, points
+    by their bounding box. The axes in `endless` are ignored for a box, unless all axes are in it.
     """
     if isinstance(form, Ball | Capsule):
         return 2 * form.radius
@@ -99,7 +98,7 @@ def close_pairs(scene: Scene, reach: float) -> Iterator[tuple[int, int, float]]:
 
 
 def image_shifts(scene: Scene) -> np.ndarray:
-    """Return by how much the nearest images of a body lie beside it, (k, d), m, beginning with zero."""
+    """Return the displacements of the nearest images of a body, (k, d), m, beginning with zero."""
     pairs = zip(scene.domain.size, scene.domain.periodic, strict=True)
     return np.array(list(product(*((0.0, -size, size) if repeats else (0.0,) for size, repeats in pairs))))
 
@@ -132,7 +131,7 @@ def _distance_from(point: np.ndarray, form: Form) -> float:
 
 
 def _outline(form: Form) -> np.ndarray:
-    """Return the vertices of a polygon or rectangle in order, or the ends of the middle of a capsule, (k, 2), m."""
+    """Return the vertices of a polygon or rectangle in order, or the ends of the axis of a capsule, (k, 2), m."""
     if isinstance(form, Polygon):
         return np.array(form.vertices)
     if isinstance(form, Capsule):
@@ -182,8 +181,9 @@ def _distance_of_convex(first: Form, second: Form) -> float:
 def _distance_by_search(first: Form, second: Form) -> float:
     """Return the distance of two forms that do not overlap, m, to 1e-3 of the extent of the smaller one.
 
-    It is the least sum of a point's distances from both, within half of it of both bounding boxes. Cells are halved;
-    those whose sum, which changes by twice the way at most, cannot become the best are left.
+    It is the smallest sum of a point's distances from both, for points within half of it of both bounding boxes. Cells
+    are halved; a cell is dropped if its sum, which changes by at most twice the displacement, cannot become the
+    smallest.
     """
     bounds = [form.bounds() for form in (first, second)]
     small = min(bounds, key=lambda pair: float(np.ptp(pair, axis=0).max()))

@@ -38,7 +38,7 @@ def material_findings(facts: SceneFacts) -> Iterator[Finding]:
 
 
 def _impact(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
-    """Yield impact speeds near the wave speed; in scenes with flow any body may be hit at the highest speed."""
+    """Yield impact speeds near the wave speed; in scenes with flow any body may be hit at the largest speed."""
     speed = facts.bounds.speed if facts.flowing else body.arrival.speed
     if body.wave_speed == 0 or speed <= FAST * body.wave_speed:
         return
@@ -97,7 +97,7 @@ def _friction(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
         f'The friction angle of body "{body.name}", {angle:.3g} degrees in plane strain, acts as {compression:.1f} '
         f"degrees in triaxial compression and as {extension:.1f} degrees in extension."
     )
-    fix = "Give the angle of plane strain; where compression from all sides decides, as in a cone's middle, give more."
+    fix = "Give the angle of plane strain; where triaxial compression dominates, as in the middle of a cone, give more."
     yield Finding("warning" if extension - angle > STEEP else "note", "friction", what, fix, angle, body.name)
 
 
@@ -109,15 +109,15 @@ def _density(facts: SceneFacts) -> Iterator[Finding]:
     ratio = heavy.body.material.density / light.body.material.density
     if ratio > DENSITY_RATIO:
         what = (
-            f'Body "{heavy.name}" is {ratio:.3g} times as dense as body "{light.name}": on the nodes that they share '
-            "the light one is carried along."
+            f'Body "{heavy.name}" is {ratio:.3g} times as dense as body "{light.name}": on shared nodes the '
+            "light one is dragged along."
         )
         fix = f"Keep the ratio of densities under {DENSITY_RATIO:g}, or leave the light body out."
         yield Finding("warning", "density-ratio", what, fix, ratio, light.name)
 
 
 def _slippery(facts: SceneFacts) -> Iterator[Finding]:
-    """Yield a material that slides on a floor without friction, which it would hold to."""
+    """Yield materials that slide on a frictionless floor although they would adhere to it."""
     (axis, side), domain = _floor(facts), facts.scene.domain
     if side is None or domain.walls.faces(facts.scene.dimension)[axis][side] not in ("slip", "separate"):
         return
@@ -131,7 +131,7 @@ def _slippery(facts: SceneFacts) -> Iterator[Finding]:
 
 
 def _unpressed(facts: SceneFacts) -> Iterator[Finding]:
-    """Yield pools at rest that begin without the pressure of rest."""
+    """Yield pools at rest that begin without hydrostatic pressure."""
     axis, side = _floor(facts)
     for body in facts.bodies if side is not None else ():
         form, source = body.body.shape.form, body.body
@@ -150,14 +150,14 @@ def _unpressed(facts: SceneFacts) -> Iterator[Finding]:
 
 
 def _floor(facts: SceneFacts) -> tuple[int, int | None]:
-    """Return the axis and the side, 0 or 1, of the wall that gravity points at; None for the side without gravity."""
+    """Return axis and side, 0 or 1, of the wall in the direction of gravity; the side is None without gravity."""
     gravity = np.nan_to_num(facts.scene.domain.gravity_at(0.0))
     axis = int(np.abs(gravity).argmax())
     return axis, int(gravity[axis] > 0) if gravity.any() else None
 
 
 def _grips(body: BodyFacts) -> bool:
-    """Return whether a body would hold to a floor: grains, mud and the like, and viscous liquids."""
+    """Return whether a body would adhere to a floor: grains, mud and the like, and viscous liquids."""
     material = body.body.material
     if hasattr(material, "friction_angle") or hasattr(material, "consistency"):
         return True

@@ -1,4 +1,4 @@
-"""`mpmcli check RESULT`: whether a run stayed stable, by its ledger and its frames, and its frames are complete."""
+"""`mpmcli check RESULT`: checks the stability of a run from its ledger and frames, and that it is complete."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -36,7 +36,7 @@ TOLD = {
     "contact_overlap": "deepest overlap of surfaces, cells",
     "contact_gap": "largest gap that acts, cells",
     "neighbour_distance": "farthest neighbours, cells",
-    "densest_cell": "densest cell / meant",
+    "densest_cell": "densest cell / intended",
     "empty_cells": "empty cells inside",
     "step_min": "smallest step, s",
     "step_max": "largest step, s",
@@ -45,15 +45,15 @@ TOLD = {
 # whose bodies share one velocity field stay below 2e-4, bodies thrown at a wall at up to five times their speed of
 # sound below 1e-3.
 ENERGY_SUSPECT, ENERGY_WRONG = 1e-2, 1e-1
-# The same where bodies separate: while they touch contact holds energy that the ledger does not have. A block of jelly
+# The same if bodies separate: during contact part of the energy is not in the ledger. A block of jelly
 # of 10 cells that rests on a floor has up to 0.03.
 CONTACT_SUSPECT = 5e-2
 # Rounding of energy in single precision, relative to the total energy.
 ENERGY_ROUNDING = 1e-4
 # Masses are summed in double precision and never change.
 MASS_ERROR = 1e-9
-# Volume that liquids and grains fill beyond that of their particles, or lack, as a fraction, in every frame of the last
-# quarter: in flight it may be more for a moment.
+# Relative difference between the volume that liquids and grains fill and that of their particles, in every frame of the
+# last quarter; in flight it may briefly be larger.
 VOLUME_ERROR, QUARTER = 0.05, 4
 # A bound may be exceeded by this factor in an impact; time.safety allows for it.
 MARGIN = 1.1
@@ -62,7 +62,7 @@ COLLAPSE = 1e-2
 # Cells per step above which particles leave all nodes that they act on. Impacts near the speed of sound reach 1.7 in
 # single steps without a gain of energy: it is the speed of a node, which particles rarely reach.
 LEFT_BEHIND = 2.0
-# Cells by which surfaces may overlap: more than what is driven by a paddle does, 0.6.
+# Cells by which surfaces may overlap: more than a body driven by a paddle, 0.6.
 OVERLAP = 1.0
 LOWER_SAFETY = "Lower time.safety, or refine the domain."
 STIFFER = "Make the material stiffer, the domain finer, or time.safety lower."
@@ -120,18 +120,18 @@ class ResultCheck:
 
 
 def check_result(path: Path) -> ResultCheck:
-    """Check ledger and frames of a result, packed or segments, whose run may go on; InputError: none of ours."""
+    """Check ledger and frames of a result, packed or segments, whose run may continue; InputError: no such result."""
     findings = FrameFindings()
     opened = open_entries(path, findings)
     check = _check(opened, findings)
     if opened.kind == "segments" and (opened.path / PACKED).exists():
-        # The run ended during the check, and has packed its frames.
+        # The run ended during the check and packed its frames.
         return check_result(opened.path)
     return check
 
 
 def check_kept(header: RunHeader, frames: Sequence[Frame], ledger: Sequence[LedgerRow]) -> ResultCheck:
-    """Check all frames of a finished run in memory, as `check_result` checks files, but not for changes since."""
+    """Check all frames of a finished run in memory, as `check_result` does for files, but without checksums."""
     entries = [
         Entry(frame.index, frame.time, row, len(frame.body), lambda frame=frame: frame)
         for frame, row in zip(frames, ledger, strict=True)
@@ -176,7 +176,7 @@ def _check_frames(opened: OpenedResult, findings: FrameFindings) -> dict[str, fl
             continue
         arrays = (frame.position, frame.velocity, frame.body, frame.material, *frame.fields.values())
         size += sum(array.nbytes for array in arrays)
-        # Values that are not finite have one finding, and must not cause others.
+        # Values that are not finite have one finding and must not cause others.
         with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
             if not state.check(frame):
                 momentum.lost()
@@ -214,13 +214,13 @@ def check_ledger(entries: Sequence[Entry], header: RunHeader, findings: FrameFin
     of = {name: np.array([getattr(row, name) for row in rows]) for name in numeric}
 
     def tell(rule: str, values: np.ndarray, bad: np.ndarray, wrong: np.ndarray | bool, what: str, fix: str) -> None:
-        """Add a finding for each row that is bad, an error where it is wrong, too."""
+        """Add a finding for each row that is bad; it is an error if the row is also wrong."""
         for k in np.flatnonzero(bad).tolist():
             severity, value = "error" if (bad & wrong)[k] else "warning", float(values[k])
             said = what.format(number=numbers[k], value=value, row=rows[k])
             findings.add(severity, rule, numbers[k], said, fix, value, kind=what)
 
-    # What came in since the start and what left is not counted. The median identifies a single row, also the first.
+    # Mass that has entered or left is not counted. The median identifies a single faulty row, also the first.
     emitted = of.get("emitted_mass", np.zeros(len(rows)))
     mass = of["mass"] - emitted + of.get("retired_mass", 0.0)
     usual = float(np.median(mass))
@@ -295,7 +295,7 @@ def _finite(value: object) -> bool:
 
 
 def energy_change(kinetic: np.ndarray, potential: np.ndarray, elastic: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the growth above the minimum so far, (T,), and what is lost in the end, over the energy turned over."""
+    """Return the growth above the minimum so far, (T,), and the final loss, both over the energy turned over."""
     total = kinetic + potential + elastic
     highest, lowest = np.maximum.accumulate, np.minimum.accumulate
     turned = highest(kinetic) + (highest(potential) - lowest(potential)) + (highest(elastic) - lowest(elastic))
@@ -305,7 +305,7 @@ def energy_change(kinetic: np.ndarray, potential: np.ndarray, elastic: np.ndarra
 
 
 def _volume_error(numbers: Sequence[int], errors: np.ndarray, findings: FrameFindings) -> float:
-    """Return the volume error that lasts to the end: the smallest one of the last quarter, 0 where its sign changes."""
+    """Return the volume error that lasts to the end: the smallest of the last quarter, 0 if its sign changes."""
     last = errors[-max(len(errors) // QUARTER, 1) :]
     first = numbers[-len(last)]
     lasting = float(last[np.abs(last).argmin()]) if abs(np.sign(last).sum()) == len(last) else 0.0

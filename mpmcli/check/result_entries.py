@@ -1,4 +1,4 @@
-"""Opens a result that may be damaged, and checks that it holds each frame at its time, and how the run ended."""
+"""Opens a result that may be damaged, and checks the times of its frames and the end of its run."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -23,16 +23,16 @@ GO_ON = "mpmcli simulate --resume goes on with it."
 WAIT = "Wait for it, or run it again."
 # Tolerance of times, relative to the duration of the run.
 TIME_ERROR = 1e-9
-# What is said of a run that did not finish, by its status.
+# Messages on a run that did not finish, by its status.
 GOES_ON = "The run has not ended; there are {far}, and "
 ENDS: dict[str, tuple[Severity, str, str, str]] = {
     "unstable": ("error", "unstable-run", "After {far} {why}", "Change what the sentence names and run it again."),
     "failed": ("error", "failed-run", "The run failed after {far}{told}", "Run it again."),
     "interrupted": ("warning", "interrupted-run", "The run was interrupted after {far}", GO_ON),
     "stopped": ("warning", "stopped-run", "The run stopped after {far}{told}", GO_ON),
-    DIED: ("warning", "died-run", "The run died after {far}: its process has ended and left no word", GO_ON),
+    DIED: ("warning", "died-run", "The run died after {far}: its process has ended without recording it", GO_ON),
     "running": ("warning", "running", GOES_ON + "it goes on", WAIT),
-    ELSEWHERE: ("warning", "running", GOES_ON + "whether it goes on cannot be seen from here", WAIT),
+    ELSEWHERE: ("warning", "running", GOES_ON + "whether it continues cannot be determined", WAIT),
 }
 
 
@@ -62,7 +62,7 @@ class OpenedResult:
 
     @property
     def status(self) -> str:
-        """How the run stands, see `run_status`."""
+        """Status of the run, see `run_status`."""
         return run_status(_directory(self.path), self.record or None)
 
     @property
@@ -77,7 +77,7 @@ class OpenedResult:
 
 
 def open_entries(path: Path, findings: FrameFindings) -> OpenedResult:
-    """Open what can be read of a result, and note the rest; InputError: nothing is there, or nothing of ours.
+    """Open the readable part of a result, and report the rest; InputError: `path` is not a result of mpmcli.
 
     Each segment is opened separately, so that damage to one does not affect the others.
     """
@@ -107,7 +107,7 @@ def _directory(path: Path) -> Path:
 
 
 def _is_damage(path: Path, error: InputError) -> bool:
-    """Return whether mpmcli wrote what cannot be read, so that it is damaged rather than of another kind."""
+    """Return whether an unreadable file was written by mpmcli, so that it is damaged rather than of another kind."""
     ours = read_record(_directory(path)) is not None
     if path.is_dir() and not (path / PACKED).exists():
         return ours  # a run that wrote no frame

@@ -1,4 +1,4 @@
-"""Checks the frames of a result: their values, momentum, distances of neighbours, and crowds."""
+"""Checks the frames of a result: values, momentum, distances of neighbours, and crowds."""
 
 from collections.abc import Iterator
 from typing import ClassVar
@@ -15,32 +15,32 @@ from mpmcli.plain_text import counted
 
 # No law is valid for J below the first. Coherent material would have torn for J above the second.
 CRUSHED, BLOWN_UP = 0.1, 10.0
-# Share of the particles of a frame on walls from which on it is said: of bodies on the grid there are none.
+# Fraction of the particles of a frame on walls that is reported; bodies on the updated grid have none.
 HELD = 0.01
 # On a GPU the Courant number is estimated between measurements, during which an impact may double the speed.
 GPU_FACTOR = 2.0
 # Distance from a wall, in cells, from which on it does not act: a particle acts on nodes up to 1.5 cells away, and the
 # first plane of nodes of a wall is the wall itself.
 WALL_REACH = 2.0
-# Distance of neighbours, in cells, above which the grid hardly sees their relative motion; with one particle per cell,
-# which stand a cell apart at rest, that at which they are stretched by SPARSE.
+# Distance of neighbours, in cells, above which the grid hardly resolves their relative motion; with one particle per
+# cell, whose distance at rest is a cell, the distance at a stretch of SPARSE.
 STRETCHED, SPARSE = 0.9, 1.25
 # Distance, in cells, that a kernel reaches.
 TORN = 1.5
 # Distance at the start, over that of a lattice, up to which two particles count as neighbours; the diagonal is at 1.41.
 NEIGHBOUR = 1.2
-# Frames of a run that are searched for crowds, and the most cells around its material of which that is done.
+# Number of frames of a run that are searched for crowds, and the largest number of cells around its material.
 FEW, MOST_CELLS = 4, 3e7
-# Particles in a cell over those meant, and share of empty cells inside, from which on it is said.
+# Particles in a cell over the nominal number, and fraction of empty cells inside, that are reported.
 CROWDED, GAPS = 3.0, 0.05
-# Mean J of a viscous liquid from which on it is said.
+# Mean J of a viscous liquid that is reported.
 OPENED = 1.2
-# Cells to each side of one that is inside, how full they are on average then, and the fewest that tell a share.
+# Cells to each side of an inner cell, their smallest mean filling, and the fewest inner cells for a fraction.
 WINDOW, INSIDE, ENOUGH = 2, 0.85, 64
 
 
 class FrameCheck:
-    """One of the checks that look at the frames of a run in their order; `figures` by name, see `ResultCheck`."""
+    """A check of the frames of a run in their order; `figures` by name, see `ResultCheck`."""
 
     START: ClassVar[dict[str, float | None]] = {}
 
@@ -61,7 +61,7 @@ class FrameCheck:
 
 
 class StateCheck(FrameCheck):
-    """Checks the values of each frame by themselves."""
+    """Checks the values of each frame separately."""
 
     def check(self, frame: Frame) -> bool:
         """Check a frame; return whether all of its values are finite."""
@@ -78,7 +78,7 @@ class StateCheck(FrameCheck):
         return finite
 
     def _inside(self, frame: Frame) -> None:
-        """Find particles out of the domain, and those that it holds on a wall (docs/theory.md, 3.5)."""
+        """Find particles outside the domain, and those that it keeps on a wall (docs/theory.md, 3.5)."""
         header, frame = self._header, frame.of_present
         if header.origin is None or len(frame.position) == 0:
             return
@@ -91,8 +91,8 @@ class StateCheck(FrameCheck):
         opened = any(header.open_axes)
         if frame.index > 0 and not opened and held > HELD * len(out):
             what = f"In frame {frame.index} {held} of {counted(len(out), 'particle')} lie on a wall"
-            what += ", where the domain holds what would leave it: the rest of their way is lost"
-            fix = 'With solids = "total" a stiffer material gives way less; "updated" lets none so near.'
+            what += ", where the domain keeps particles that would leave it: the rest of their displacement is lost"
+            fix = 'With solids = "total" a stiffer material deforms less; "updated" keeps particles away from walls.'
             self._findings.add("note", "held-positions", frame.index, what, fix, value=held / len(out))
         # At an open face particles stay outside until the next sort.
         late = 2 * header.spacing * np.array(header.open_axes) if opened else 0.0
@@ -124,7 +124,7 @@ class StateCheck(FrameCheck):
 
 
 def extent(position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lower and the upper corner of the particles, (d,) each, m; column by column, which is faster."""
+    """Return the lower and the upper corner of the particles, (d,) each, m; by columns, which is faster."""
     columns = np.ascontiguousarray(position.T)
     return columns.min(1), columns.max(1)
 
@@ -138,14 +138,14 @@ def volume_ratio(header: RunHeader, frame: Frame) -> np.ndarray | None:
 
 
 def _reach(header: RunHeader, row: LedgerRow, frame: Frame) -> float | None:
-    """Return the largest displacement in a row's steps, m, with shifts and rounding; None: not known."""
+    """Return the largest displacement in a row's steps, m, with shifts and rounding; None if unknown."""
     if header.spacing is None or not np.isfinite(row.courant_max):
         return None
     factor = GPU_FACTOR if header.on_gpu else 1.0
     rounding = row.steps * header.step_error + 2 * header.place_error(frame.position.dtype)
     shifts = header.shifts and any(law.name in laws() and laws()[law.name].shifts for law in header.laws)
     shifted = header.shifted(row.steps, frame.step) if shifts else 0.0
-    # What an emitter lets in begins where it would be, had it entered when it was due: up to a step before.
+    # A particle from an emitter begins at the position that follows from its due time, up to a step earlier.
     steps = row.steps + bool(row.emitted)
     return factor * steps * row.courant_max * header.spacing * (1 + 1e-3) + shifted + rounding
 
@@ -153,10 +153,10 @@ def _reach(header: RunHeader, row: LedgerRow, frame: Frame) -> float | None:
 class MomentumCheck(FrameCheck):
     """Compares the momentum of the ledger with P0 + M g (t - dt/2) while no wall can have acted.
 
-    What colliders took counts as there; velocities are those in the middle of the last step. Along an axis momentum is
-    conserved while no particle is near a wall normal to it or one with "stick"; angular momentum without gravity, far
-    from all walls, if the transfer conserves it (docs/theory.md, 9.2). The drift is relative to sqrt(2 M E_kin), a
-    bound on sum m |v|.
+    Momentum transferred to colliders is included; velocities are those in the middle of the last step. Momentum along
+    an axis is conserved while no particle is near a wall normal to it or one with "stick"; angular momentum without
+    gravity, far from all walls, if the transfer conserves it (docs/theory.md, 9.2). The drift is relative to sqrt(2 M
+    E_kin), a bound on sum m |v|.
     """
 
     START: ClassVar = {"momentum_drift": None, "momentum_frames": 0}
@@ -168,7 +168,7 @@ class MomentumCheck(FrameCheck):
         self._colliders = len(header.collider_names)
         known = header.origin is not None and header.gravity is not None and header.sticking is not None
         self._free = np.full(header.dimension, known and not header.driven)
-        # Of the particles from the walls normal to each axis, in the frame before.
+        # Distance of the particles from the walls normal to each axis, in the previous frame.
         self._distance = np.zeros(header.dimension)
 
     def check(self, frame: Frame, row: LedgerRow) -> None:
@@ -216,12 +216,12 @@ class MomentumCheck(FrameCheck):
             self._findings.add("warning", "momentum", frame.index, what, fix, value=drift)
 
     def lost(self) -> None:
-        """Compare no further frames: one could not be read, or is not finite."""
+        """Stop the comparison, because a frame could not be read or is not finite."""
         self._free[:] = False
 
 
 class StretchCheck(FrameCheck):
-    """Follows neighbours in elastic bodies, which the grid must see."""
+    """Follows the distance of neighbours in elastic bodies, which the grid must resolve."""
 
     START: ClassVar = {"neighbour_distance": None}
     _pairs: list[tuple[BodyHeader, np.ndarray, np.ndarray, float]] | None = None
@@ -240,9 +240,9 @@ class StretchCheck(FrameCheck):
                 continue
             severity = "warning" if cells > TORN else "note"
             count = int((squares > (allowed * h) ** 2).sum())
-            told = f"farther than {TORN:g}, which a kernel reaches: it has torn, which its material cannot"
+            told = f"farther than {TORN:g}, the reach of a kernel: it has torn, although its material cannot"
             if severity == "note":
-                told = f"above {allowed:.3g}: the grid hardly sees what moves between them, noise grows, and gaps open"
+                told = f"above {allowed:.3g}: the grid hardly resolves motion between them, noise grows, and gaps open"
             what = f'In frame {frame.index} {count} pairs of neighbours of body "{body.name}"'
             what += f" stand up to {cells:.3g} cells apart, {told}"
             per_axis = int(np.ceil(body.particles_per_cell ** (1 / header.dimension) * cells / STRETCHED))
@@ -250,7 +250,7 @@ class StretchCheck(FrameCheck):
             self._findings.add(severity, "stretch", frame.index, what, fix, cells, body.name, kind=body.name)
 
     def _neighbours(self, frame: Frame, h: float) -> Iterator[tuple[BodyHeader, np.ndarray, np.ndarray, float]]:
-        """Yield each elastic body that moves on the grid, rows of its pairs along axes, and the cells they may have."""
+        """Yield each elastic body on the updated grid, rows of its pairs along axes, and their permitted cells."""
         for label, body in enumerate(() if self._header.total else self._header.bodies):
             rows = np.flatnonzero(frame.body == label)
             law = self._header.laws[frame.material[rows[0]]] if len(rows) and self._header.laws else None
@@ -270,9 +270,9 @@ class StretchCheck(FrameCheck):
 
 
 class CrowdCheck(FrameCheck):
-    """Looks for crowds of liquids and grains, and for viscous liquids that spray, in a few frames and the last one.
+    """Finds crowds of liquids and grains, and viscous liquids that spray, in a few frames and the last one.
 
-    Its figures are those of the last frame that was looked at, None without such material.
+    Its figures are those of the last frame examined, None without such material.
     """
 
     START: ClassVar = {"densest_cell": None, "empty_cells": None}
@@ -281,7 +281,7 @@ class CrowdCheck(FrameCheck):
         super().__init__(header, findings)
         self._flows = np.array([law.name in laws() and laws()[law.name].flows for law in header.laws], bool)
         self._share = np.array([1 / body.particles_per_cell for body in header.bodies])
-        # Of fewer than two along an axis a crowd is no more than chance.
+        # With fewer than two particles along an axis a crowd may be due to chance.
         coarse = (self._share > 2.0**-header.dimension).any()
         known = header.spacing is not None and header.origin is not None and self._flows.any()
         self._looked_at = {*range(0, last + 1, max(1, (last + 1) // FEW)), last} if known and not coarse else set()
@@ -296,7 +296,7 @@ class CrowdCheck(FrameCheck):
         if not rows.any():
             return
         cells = np.floor((frame.position[rows] - header.origin) / header.spacing)
-        # Cells around the material, of which those of the middle have whole windows.
+        # Cells around the material; the middle cells have complete windows.
         margin = 2 * WINDOW
         first = cells.min(axis=0) - margin
         shape = cells.max(axis=0) - first + 1 + margin
@@ -305,7 +305,8 @@ class CrowdCheck(FrameCheck):
         first, shape = first.astype(int), shape.astype(int)
         places = np.ravel_multi_index((cells.astype(int) - first).T, shape)
         filled = np.bincount(places, self._share[frame.body[rows]], int(np.prod(shape))).reshape(shape)
-        # Means over the cells of the domain alone, as nothing can be behind its walls; axes take turns as the last one.
+        # Means over the cells of the domain alone, because no material is behind its walls; each axis in turn is the
+        # last.
         around, ends = filled, np.round((header.upper - header.origin) / header.spacing)
         for axis in reversed(range(header.dimension)):
             along = np.arange(shape[axis]) + first[axis]
@@ -317,7 +318,7 @@ class CrowdCheck(FrameCheck):
         densest, empty = float(filled.max()), float(holes.mean()) if len(holes) >= ENOUGH else 0.0
         self.figures = {"densest_cell": densest, "empty_cells": empty}
         if densest > CROWDED or empty > GAPS:
-            what = f"In frame {frame.index} a cell of liquid or grains has {densest:.3g} times the particles meant"
+            what = f"In frame {frame.index} a cell of liquid or grains has {densest:.3g} times the intended particles"
             what += f", and {100 * empty:.2g} % of the cells inside have none: flow has piled particles up"
             fix = 'Refine the domain, or set sampling = "turned".'
             if not header.shifts:
@@ -325,7 +326,7 @@ class CrowdCheck(FrameCheck):
             self._findings.add("note", "crowd", frame.index, what, fix, value=densest)
 
     def _spray(self, frame: Frame) -> None:
-        """Find viscous bodies that have opened, as only what falls apart into drops does."""
+        """Find viscous bodies whose volume has grown, which shows that they break up into drops."""
         J = volume_ratio(self._header, frame)
         for label, body in enumerate(self._header.bodies if J is not None else ()):
             own = J[frame.body == label]

@@ -1,4 +1,4 @@
-"""Check of a scene before the run: the safe step and its cause, findings, and a forecast; as data and as text."""
+"""Check of a scene before the run: safe step and its cause, findings, and a forecast; as data and as text."""
 
 from collections import Counter
 from collections.abc import Iterable
@@ -63,7 +63,7 @@ class SceneCheck:
         return "\n\n".join(part for part in parts if part)
 
     def outlook(self) -> str:
-        """Return one line for a run that begins: steps and what sets them, frames, disk, time."""
+        """Return a line for the start of a run: steps and their cause, frames, disk, time."""
         forecast, limit, step = self.forecast, self.facts.binding, self.facts.taken(self.facts.step_expected)
         cause = f"by the {limit.name} limit" + (f' of "{limit.body}"' if limit.body else "")
         if step < self.facts.step_expected:
@@ -103,7 +103,7 @@ def check_scene(
 ) -> SceneCheck:
     """Check a scene, without Taichi; the plan is by default for all cores, the probe measures the cost of a step.
 
-    `directory` is where results would go, `threads` those of the run: None for as many as the scene has use for.
+    `directory` is the place of results, `threads` those of the run: None for as many as the scene can use.
     InputError: no step is stable, or more than MOST_STEPS are needed.
     """
     scene = loaded.scene

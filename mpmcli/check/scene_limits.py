@@ -17,7 +17,7 @@ from mpmcli.stability.transfer_factors import step_inertia
 # Velocity gradient of an impact, in speeds per cell: one side of a cell stops while matter enters from two nodes.
 IMPACT_GRADIENT = 2.0
 # A wave that reaches a free surface ejects matter at twice its speed, and jets from a corner are about as fast: 1.6 to
-# 2.5 times the speed of the fall in seven scenes of eight, 3 times in one with colliding bodies.
+# 2.5 times the speed of the fall in seven of eight scenes, 3 times in one with colliding bodies.
 JET = 2.0
 # A node at the edge of stressed matter takes up to 6 |tau| dt / (density h) in a step, which at the default step is 4.8
 # times the speed sqrt(2 W / density) that the stored energy can give: 1.9 to 4.3 times that in random scenes.
@@ -34,7 +34,7 @@ class Start:
 
 @dataclass(frozen=True)
 class SceneLimit:
-    """One bound on the time step, s, without safety, of a `body` or ""; `why` and `fix` are sentences with numbers."""
+    """A bound on the time step, s, without safety, for a `body` or ""; `why` and `fix` are sentences with numbers."""
 
     value: float
     name: str
@@ -83,7 +83,7 @@ def starts_of(scene: Scene) -> list[Start]:
 
 
 def reachable(scene: Scene, starts: Sequence[Start]) -> SceneBounds:
-    """Return what the scene can reach, with the speed v^2 = 2 W / density that the energy W at the start can give."""
+    """Return the bounds of a scene, including the speed v^2 = 2 W / density from the energy W stored at the start."""
     bounds, release = scene_bounds(scene), _release_speed(scene, starts)
     return bounds if release == 0 else replace(bounds, speed=math.hypot(bounds.speed, release))
 
@@ -105,7 +105,7 @@ def joined(start: StateBound, reached: StateBound) -> StateBound:
 
 
 def scene_limits(scene: Scene, bounds: SceneBounds, starts: Sequence[Start] | None = None) -> list[SceneLimit]:
-    """Return all limits within `bounds`: of each body at its start and stiffest, then of motion."""
+    """Return all limits within `bounds`: of each body at the start and in its stiffest state, then of motion."""
     limits, starts = [], starts or starts_of(scene)
     begun = [*starts, *(Start() for _ in scene.emitters)]
     for body, start in zip(scene.sources, begun, strict=True):
@@ -117,7 +117,7 @@ def scene_limits(scene: Scene, bounds: SceneBounds, starts: Sequence[Start] | No
 
 
 def _material_limits(body: Body, law: Law, state: str, bound: StateBound, scene: Scene) -> Iterator[SceneLimit]:
-    """Yield the smallest limit of each name that the modes of one body set in one state."""
+    """Yield the smallest limit of each name from the modes of one body in one state."""
     density, spacing, solver = body.material.density, scene.domain.spacing, scene.solver
     inertia = step_inertia(solver)
     smallest: dict[str, tuple[float, float, float]] = {}

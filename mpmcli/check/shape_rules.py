@@ -1,7 +1,7 @@
-"""Rules on shapes and on what moves them.
+"""Rules on shapes and on their motion.
 
-On resolution: thin bodies, gaps, distance from walls, particles per cell, and stretch. On what drives a scene: bodies
-that spin too fast, colliders that leave too little room or cannot move.
+Resolution: thin bodies, gaps, distance from walls, particles per cell, and stretch. Motion: bodies that spin too fast,
+    colliders that leave too little room or cannot move.
 """
 
 import math
@@ -21,7 +21,7 @@ from mpmcli.scene.quantity import AXES
 from mpmcli.scene.sampling import initial_deformation, initial_motion, moves_unevenly
 from mpmcli.scene.surface import form_surface, surface_points
 
-# Cells across a body below which internal motion is not resolved, and a rigid one lets through. The stencil is three
+# Cells across a body below which internal motion is not resolved, and a rigid body is permeable. The stencil is three
 # nodes wide, so that with three cells one row of particles is not affected by the surface (tests/hard_cases, H12).
 FEWEST_CELLS = 3.0
 # Distance, in cells, below which two particles always share a node, by kernel.
@@ -33,16 +33,16 @@ WALL_REACH = 1.0
 # Particles per axis of a cell. Below two, stretched matter tears (numerical fracture) and sums over particles are poor
 # quadratures; above four, the cost grows without a gain in accuracy.
 FEWEST_PER_AXIS, MOST_PER_AXIS = 2, 4
-# Largest strain of a disc that spins, over the square of the speed of its rim over its waves' (Timoshenko and Goodier,
-# Theory of Elasticity, section 32: (3 + nu) / 8 rho v^2 in the middle); strains that matter, and that nothing survives.
+# Largest strain of a spinning disc over the squared ratio of its rim speed to its wave speed (Timoshenko and Goodier,
+# Theory of Elasticity, section 32: (3 + nu) / 8 rho v^2 in the middle); strains that are reported, and that destroy it.
 STRAIN, STRAINED, BURST = 3 / 8, 0.05, 1.0
-# Room over the volume of what fills it: matter is pressed below the first, and crushed below the second.
+# Room over the volume of the material in it: material is compressed below the first, and crushed below the second.
 TIGHT, CRUSHED = 0.95, 0.25
-# Cells by which a rigid body may begin inside of something.
+# Cells by which a rigid body may begin inside another body.
 BEGINS_INSIDE = 0.1
-# Cells between a rigid body and what stands below it, from which on liquid gets there.
+# Cells between a rigid body and the body below it from which on liquid enters the gap.
 UNDER = 1.0
-# Points along the longest axis of the lattice on which room is measured, and instants of the run.
+# Points along the longest axis of the lattice that measures room, and number of instants of the run.
 POINTS, INSTANTS = {2: 96, 3: 32}, 33
 
 
@@ -76,7 +76,7 @@ def _gaps(facts: SceneFacts) -> Iterator[Finding]:
         first, second = bodies[i], bodies[j]
         if cells <= TOUCHING or cells >= reach * (1 - 1e-6) or facts.scene.friction_between(first, second) is not None:
             continue
-        # Bodies with equal velocity would come to rest in contact; those that pass each other are dragged along.
+        # Bodies with equal velocity would come to rest in contact; bodies that pass each other are dragged along.
         passing = not np.array_equal(first.velocity, second.velocity)
         what = (
             f'Bodies "{first.name}" and "{second.name}" are {cells:.2g} cells apart and already act on each other, as '
@@ -126,7 +126,7 @@ def _particles(facts: SceneFacts) -> Iterator[Finding]:
 
 
 def _stretched(facts: SceneFacts) -> Iterator[Finding]:
-    """Yield the distance to which the start of an elastic body will pull its particles, where they move on the grid."""
+    """Yield the distances to which the start of an elastic body on the updated grid will stretch its particles."""
     d = facts.scene.dimension
     if facts.scene.solver.solids == "total":
         return
@@ -135,12 +135,12 @@ def _stretched(facts: SceneFacts) -> Iterator[Finding]:
             continue
         stretch = _stretch_to_come(facts, body)
         cells = stretch * body.body.particles_per_cell ** (-1 / d)
-        # Of one particle per cell there is a finding anyway.
+        # One particle per cell has a finding of its own.
         if not STRETCHED < cells < math.inf or stretch * STRETCHED <= 1:
             continue
         what = (
             f'The start of body "{body.name}" stretches it by about {stretch:.3g}, so that its particles come to stand '
-            f"{cells:.3g} cells apart: above {STRETCHED:g} the grid hardly sees what moves between them, noise grows, "
+            f"{cells:.3g} cells apart: above {STRETCHED:g} the grid hardly resolves motion between them, noise grows, "
             f"and above {TORN:g} it tears."
         )
         more = f"Set particles_per_cell = {math.ceil(stretch / STRETCHED) ** d}, or start" if stretch < 10 else "Start"
@@ -149,10 +149,10 @@ def _stretched(facts: SceneFacts) -> Iterator[Finding]:
 
 
 def _stretch_to_come(facts: SceneFacts, body: BodyFacts) -> float:
-    """Return the stretch of distances, as they are at the start, that the start of an elastic body makes.
+    """Return the stretch of initial distances that the initial state of an elastic body will cause.
 
-    Relaxing undoes the initial deformation, which is 1 over its smallest stretch. Matter that moves at v relative to
-    the body, its rotation left out, strains it by v / c, c = sqrt(E / density), where waves of v meet its ends.
+    Relaxation undoes the initial deformation, a stretch of 1 over its smallest one. Matter that moves at v relative to
+    the body, apart from its rotation, strains it by v / c, c = sqrt(E / density), where its waves meet its ends.
     """
     stretch, material = 1.0, body.body.material
     points = body_points(body.body)
@@ -180,7 +180,7 @@ def drive_findings(facts: SceneFacts) -> Iterator[Finding]:
 
 
 def _rotation(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
-    """Yield a spin whose rim is fast beside the waves that hold it; what flows is not held."""
+    """Yield solids whose rim moves too fast relative to their waves; material that flows is exempt."""
     if body.flows or body.stiffness == 0:
         return
     places = body_points(body.body)
@@ -188,7 +188,7 @@ def _rotation(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
     if not np.isfinite(velocity).all() or not velocity.any():
         return
     arms, motion = places - places.mean(axis=0), velocity - velocity.mean(axis=0)
-    # The linear field nearest to the velocities; its skew part is the rotation.
+    # Least-squares linear fit of the velocities; its skew part is the rotation.
     linear = np.linalg.lstsq(arms, motion, rcond=None)[0].T
     rim = float(np.linalg.norm(arms @ (0.5 * (linear - linear.T)).T, axis=1).max())
     modulus = getattr(body.body.material, "youngs_modulus", None)
@@ -200,8 +200,8 @@ def _rotation(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
         return
     does = "flies apart" if strain > BURST else "widens"
     what = (
-        f'Body "{body.name}" spins so that its rim has {rim:.3g} m/s and its waves {waves:.3g} m/s: it is strained by '
-        f"about {100 * strain:.2g} %, and {does}."
+        f'Body "{body.name}" spins with a rim speed of {rim:.3g} m/s and a wave speed of {waves:.3g} m/s: it is '
+        f"strained by about {100 * strain:.2g} %, and {does}."
     )
     least = strain / STRAINED
     fix = f"Spin it {math.sqrt(least):.2g} times slower, or make it {least:.2g} times as stiff."
@@ -209,14 +209,14 @@ def _rotation(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
 
 
 def _rigid(facts: SceneFacts) -> Iterator[Finding]:
-    """Yield rigid bodies that are too small for the grid, and those that begin inside of something."""
+    """Yield rigid bodies that are too small for the grid, and those that begin inside another body."""
     scene, h = facts.scene, facts.scene.domain.spacing
     shut = np.array(scene.domain.walls.faces(scene.dimension)) != "open"
     for body in (collider for collider in scene.colliders if collider.free):
         lower, upper = np.array(body.form.bounds())
         cells = float((upper - lower).min() / h)
         if cells < FEWEST_CELLS:
-            what = f'Rigid body "{body.name}" is {cells:.2g} cells thick: what is on its two sides meets through it.'
+            what = f'Rigid body "{body.name}" is {cells:.2g} cells thick: material on both sides interacts through it.'
             fix = f"Make it {FEWEST_CELLS:g} cells thick, or the spacing {h * cells / FEWEST_CELLS:.2g} m."
             yield Finding("warning", "thin", what, fix, cells, body.name)
         long = np.where(shut.all(axis=1), (upper - lower) / scene.domain.size, 0.0)
@@ -240,15 +240,15 @@ def _rigid(facts: SceneFacts) -> Iterator[Finding]:
                 yield Finding("warning", "overlap", what, f"Move it by {depth * h:.2g} m.", depth, body.name)
             elif depth > -UNDER * (1 - 1e-6) and wet:
                 what = (
-                    f'Rigid body "{body.name}" begins {abs(min(depth, 0)):.2g} cells from {name}: no liquid gets '
-                    "between them, so that it is pressed there and does not float up."
+                    f'Rigid body "{body.name}" begins {abs(min(depth, 0)):.2g} cells from {name}: no liquid '
+                    "enters the gap, so that pressure holds it there and it does not float up."
                 )
                 fix = f"Set it {UNDER * h:.3g} m away if it should."
                 yield Finding("note", "no-liquid-between", what, fix, -depth, body.name)
 
 
 def _room(facts: SceneFacts) -> Iterator[Finding]:
-    """Yield moving colliders that leave some bodies less room than they fill."""
+    """Yield moving colliders that leave bodies less room than their volume."""
     scene = facts.scene
     words = {word for pair in scene.domain.walls.faces(scene.dimension) for word in pair}
     moving = [collider for collider in scene.colliders if collider.driven and not collider.holds]
@@ -260,18 +260,18 @@ def _room(facts: SceneFacts) -> Iterator[Finding]:
         return
     unit = "m^2" if scene.dimension == 2 else "m^3"
     what = (
-        f"Colliders that move leave {ratio * volume:.2g} {unit} at {time:.3g} s to what fills {volume:.2g} {unit} at "
-        f"the start ({names}): it is {'crushed' if ratio < CRUSHED else 'pressed together'}."
+        f"Moving colliders leave {ratio * volume:.2g} {unit} at {time:.3g} s for material that fills "
+        f"{volume:.2g} {unit} at the start ({names}): it is {'crushed' if ratio < CRUSHED else 'pressed together'}."
     )
     fix = "Let them stop earlier, or leave a way out of more than two cells."
     yield Finding("error" if ratio < CRUSHED else "warning", "room", what, fix, ratio)
 
 
 def _rooms(scene: Scene) -> Iterator[tuple[float, float, float, str]]:
-    """Yield (room over volume, time, volume, names of bodies) at instants, for the matter of each room of the start.
+    """Yield (room over volume, time, volume, names of bodies) at instants, for the matter in each initial room.
 
-    A room is a part of the domain outside of colliders that is connected; matter stays in those parts that its own
-    room overlaps from one instant to the next.
+    A room is a connected part of the domain outside colliders. Matter stays in the parts that overlap its room from one
+    instant to the next.
     """
     from scipy.ndimage import label
 
@@ -281,7 +281,7 @@ def _rooms(scene: Scene) -> Iterator[tuple[float, float, float, str]]:
     lattice = grid_points(*(np.arange(n) + 0.5 for n in counts)) * cell + origin
 
     def parts(time: float) -> np.ndarray:
-        """Return the number of the part in which each point lies, from 1 on; 0 of what is in a collider."""
+        """Return the number of the part that contains each point, from 1 on; 0 inside a collider."""
         free = np.ones(len(lattice), bool)
         for collider in (collider for collider in scene.colliders if not collider.holds):
             free &= collider.signed_distance(lattice, time) > 0

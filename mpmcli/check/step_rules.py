@@ -1,4 +1,4 @@
-"""Rules on the time step, on what the transfers take in each step, and on single precision."""
+"""Rules on the time step, on losses of the transfers in each step, and on single precision."""
 
 import math
 from collections.abc import Iterator
@@ -19,7 +19,7 @@ from mpmcli.stability.transfer_factors import impact_loss, loss_per_step, step_i
 # Ratio to the stable step below which a step is reported: four times the cost and loss of energy (tests/hard_cases,
 # H19).
 SMALL_STEP = 0.25
-# Factor on the step without a body from which on that is said.
+# Factor on the step without a body from which on it is reported.
 MUCH_STIFFER = 4.0
 # Consequence of a step above each limit.
 LONE = "above it a lone particle, and with it the run, is unstable"
@@ -30,21 +30,21 @@ CONSEQUENCE = {
     "deformation": "particles are inverted",
     "collider": "colliders pass the material by",
 }
-# Share of energy that a wave loses in the run, and that viscosity takes, above which they matter.
+# Fractions of energy lost by a wave in the run, and dissipated by viscosity, above which they matter.
 NOTED_LOSS = 0.1
-# Share of the viscosity asked, or of the energy of an impact, above which the scheme's own loss is noted.
+# Fraction of the given viscosity, or of the energy of an impact, above which the scheme's own loss is reported.
 NOTED_SHARE = 0.02
 # Largest relative rounding error of a number of 32 bits.
 HALF_ULP = 2.0**-24
-# Rounding of a position in a frame over the way of its body in the run. A step loses nothing: particles carry what
-# rounding takes from their positions (docs/theory.md, 8.3).
+# Rounding of a position in a frame over the displacement of its body in the run. A step loses nothing: particles carry
+# the rounding error of their positions (docs/theory.md, 8.3).
 LOST_MOTION = 0.1
 # Ratio of the stress from rounding of F to the stress from gravity or speed (tests/hard_cases, H9).
 STRESS_NOISE = 0.01
 
 
 def step_findings(facts: SceneFacts) -> Iterator[Finding]:
-    """Yield the findings on time.step, and on a body that is much stiffer than all others."""
+    """Yield the findings on time.step, and on a body that is much stiffer than the others."""
     yield from _stiff(facts)
     step, safety = facts.scene.time.step, facts.scene.time.safety
     if step == "auto":
@@ -82,7 +82,7 @@ def step_findings(facts: SceneFacts) -> Iterator[Finding]:
 
 
 def _stiff(facts: SceneFacts) -> Iterator[Finding]:
-    """Yield a solid that alone sets the step: as a rigid body it would set none."""
+    """Yield a solid that alone limits the step; a rigid body would not."""
     binding = facts.binding
     body = next((one for one in facts.scene.bodies if one.name == binding.body), None)
     if body is None or not body.material.solid or body.shape.points or len(facts.scene.sources) < 2:
@@ -99,14 +99,14 @@ def _stiff(facts: SceneFacts) -> Iterator[Finding]:
 
 
 def loss_findings(facts: SceneFacts) -> Iterator[Finding]:
-    """Yield the findings on the loss by the transfers: energy of waves and of impacts, and viscosity that is added."""
+    """Yield the findings on losses by the transfers: energy of waves and of impacts, and added viscosity."""
     for body in facts.bodies:
-        # No wave across less than a cell is on the grid.
+        # The grid has no waves across less than a cell.
         resolved = body.thickness >= facts.scene.domain.spacing
         added = list(_viscosity(facts, body)) if resolved else []
         yield from added or _dissipation(facts, body)
-        # What flows loses its energy anyway, and what it hits may be carried along. Known for the grid on which bodies
-        # move: on that of their state at rest they lose a third of it.
+        # A body that flows dissipates its energy anyway, and a body hit by it may be carried along. The loss is known
+        # for the updated grid; on the grid of the state at rest it is a third.
         if resolved and not facts.flowing and facts.scene.solver.solids == "updated":
             yield from _impact(facts, body)
 
@@ -143,14 +143,14 @@ def _viscosity(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
     step = damped_step(facts, body, scene.time.end / expected_steps(facts))
 
     def share(settings: SolverSettings, spacing: float, step: float) -> float:
-        """nu_num / nu: a wave of a free transfer loses its amplitude as an elastic one its energy."""
+        """Return nu_num / nu: a shear wave loses amplitude at the rate at which an elastic wave loses energy."""
         return loss_per_step(settings, k * spacing) / (step * (own * k * k))
 
     h = scene.domain.spacing
     added = share(scene.solver, h, step)
     if not added >= NOTED_SHARE:
         return
-    # With half the spacing waves allow half the step, viscosity a quarter.
+    # Half the spacing permits half the step for waves, a quarter for viscosity.
     finer = share(scene.solver, h / 2, step / (4 if facts.binding.name == "viscosity" else 2))
     what = (
         f'On a flow across body "{body.name}", half a wave of {width / h:.3g} cells, the transfers act as '
@@ -175,7 +175,7 @@ def _impact(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
         return
     form, share = body.body.shape.form, 1.0
     if isinstance(form, Ball):
-        # What an impact of a ball brings together, sqrt(2 h / R + 4 mach) a side.
+        # The zone that an impact of a ball brings into contact, sqrt(2 h / R + 4 mach) per side.
         share = min(1.0, (2 * h / form.radius + 4 * mach) ** ((len(form.center) - 1) / 2))
     length, surfaces = chord(form, velocity / speed), scene.separates(body.body)
 
@@ -212,7 +212,7 @@ def _percent(share: float) -> str:
 
 
 def flow_width(facts: SceneFacts, body: BodyFacts) -> float:
-    """Return half the longest wave of a flow along walls, m: of a box its width, twice that with one "stick" side."""
+    """Return half the longest wave of a flow along walls, m: the width of a box, twice that with one "stick" side."""
     scene, form = facts.scene, body.body.shape.form
     if not isinstance(form, Box):
         return body.thickness
@@ -226,7 +226,7 @@ def flow_width(facts: SceneFacts, body: BodyFacts) -> float:
 
 
 def chord(form: Form, direction: np.ndarray) -> float:
-    """Return the mean length of a shape along a unit vector, m: volume over projection, of no ball that of its box."""
+    """Return the mean length of a shape along a unit vector, m: volume over projection of the ball or bounding box."""
     if isinstance(form, Ball):
         return form.radius * (math.pi / 2 if len(direction) == 2 else 4 / 3)
     # The bounding box of points ends at their centres.
@@ -240,7 +240,8 @@ def rounding_findings(facts: SceneFacts) -> Iterator[Finding]:
         return
     end = facts.scene.time.end
     for body in facts.bodies:
-        # Positions are relative to the origin of the domain, so that the farthest of a body is rounded most.
+        # Positions are relative to the origin of the domain, so that the farthest one of a body has the largest
+        # rounding.
         farthest = float(np.max(body.body.shape.form.bounds()[1] - facts.scene.domain.origin))
         speed = facts.bounds.speed if facts.deformed else highest_speed(body.body)
         way = (speed + facts.bounds.gravity * end) * end

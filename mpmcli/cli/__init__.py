@@ -8,7 +8,7 @@ __all__ = ["main"]
 
 
 def main(arguments: list[str] | None = None) -> NoReturn:
-    """Run the command line, see `program.main`; an interrupt while it is loaded is one too."""
+    """Run the command line, see `program.main`; interrupts during loading are handled too."""
     leave_at_once()
     from mpmcli.cli import program
 

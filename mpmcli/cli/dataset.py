@@ -13,13 +13,13 @@ from mpmcli.cli.options import COUNT, PATH, json_option, quiet_option
 from mpmcli.cli.streams import print_answer, print_json, print_note, print_text
 from mpmcli.errors import InputError
 
-# Time in which the workers of a sweep end, and this process, s.
+# Time in which the workers of a sweep and this process end, s.
 RESERVE = 5.0
 
 
 @click.command("sweep", epilog="Example: mpmcli sweep drops.toml --count 8 -o datasets/drops")
 @click.argument("sweep", type=PATH)
-@options.output_option("Where the dataset goes; datasets/<name of the sweep> by default.", "DATASET", "directory")
+@options.output_option("Directory of the dataset; datasets/<name of the sweep> by default.", "DATASET", "directory")
 @click.option("--count", type=COUNT, help="Number of trajectories, in place of that of the file.")
 @click.option("--workers", type=COUNT, help="Processes on this machine; one on each core by default.")
 @click.option("--scheduler", metavar="ADDRESS", default="", help="Use the workers of a running Dask scheduler.")
@@ -33,10 +33,10 @@ RESERVE = 5.0
 )
 @options.set_option
 @click.option("--overwrite", is_flag=True, help="Replace the dataset in the directory.")
-@click.option("--resume", is_flag=True, help="Go on with the dataset in the directory.")
+@click.option("--resume", is_flag=True, help="Continue the dataset in the directory.")
 @click.option("--dry-run", is_flag=True, help="List the draws, check each scene, and forecast time and disk space.")
-@options.arch_option("Where each worker computes")
-@options.time_option("End the sweep before this wall time, to go on with --resume: 2h, 90m, 45s, 1h30m or 1:30:00.")
+@options.arch_option("Backend of each worker")
+@options.time_option("End the sweep before this wall time; --resume continues it: 2h, 90m, 45s, 1h30m or 1:30:00.")
 @options.plugin_option
 @quiet_option
 @json_option
@@ -53,9 +53,9 @@ def sweep_command(
 ) -> int:
     """Compute the trajectories of SWEEP, a TOML file, and store them as a dataset.
 
-    An interrupted or killed sweep goes on with --resume. Trajectories that are not stable are computed again with
-    half the step, up to twice, and then left out; the exit code is 1 if there are any. --set replaces keys of the base
-    scene, for all trajectories.
+    --resume continues an interrupted or killed sweep. Trajectories that are not stable are computed again with half the
+    step, up to twice, and then left out; the exit code is 1 if there are any. --set replaces keys of the base scene for
+    all trajectories.
     """
     from mpmcli.cli.progress import ProgressBar
     from mpmcli.dataset.report import status_of
@@ -108,14 +108,14 @@ def sweep_command(
 
 @click.group("dataset")
 def dataset_command() -> None:
-    """Look after datasets that `mpmcli sweep` has made."""
+    """Inspect, verify and merge datasets of `mpmcli sweep`."""
 
 
 @dataset_command.command("status", epilog="Example: mpmcli dataset status datasets/drops")
 @click.argument("dataset", type=PATH)
 @json_option
 def status(dataset: Path, as_json: bool) -> None:
-    """Count the trajectories of DATASET by verdict and split, and say why some were left out."""
+    """Count the trajectories of DATASET by verdict and split, and give the reasons for exclusions."""
     from mpmcli.dataset.report import status_of
 
     print_answer(status_of(dataset), as_json)
@@ -126,9 +126,9 @@ def status(dataset: Path, as_json: bool) -> None:
 @quiet_option
 @json_option
 def verify(dataset: Path, quiet: bool, as_json: bool) -> int:
-    """Read all of DATASET, and compare every checksum and count with its manifest; or an export with its checksums.
+    """Read all of DATASET and compare every checksum and count with its manifest, or an export with its checksums.
 
-    The exit code is 1 if anything differs or is missing.
+    The exit code is 1 if there are differences or missing files.
     """
     from mpmcli.cli.progress import ProgressBar
     from mpmcli.dataset.export import is_export, verify_export
@@ -147,7 +147,7 @@ def verify(dataset: Path, quiet: bool, as_json: bool) -> int:
 @dataset_command.command("card", epilog="Example: mpmcli dataset card datasets/drops")
 @click.argument("dataset", type=PATH)
 def card(dataset: Path) -> None:
-    """Write README.md of DATASET again, with the picture montage.png if `mpmcli render` has drawn it."""
+    """Write README.md of DATASET again, with the picture montage.png if it exists."""
     from mpmcli.dataset.report import status_of, write_card
 
     status_of(dataset)
@@ -159,7 +159,7 @@ def card(dataset: Path) -> None:
 @click.option("-o", "--output", type=PATH, metavar="DATASET", required=True)
 @json_option
 def merge(parts: tuple[Path, ...], output: Path, as_json: bool) -> None:
-    """Join PARTS, made by `mpmcli sweep --shard`, into one dataset. The parts stay as they are."""
+    """Join PARTS, made by `mpmcli sweep --shard`, into one dataset. The parts are not changed."""
     from mpmcli.dataset.merge import merge
 
     print_answer(merge(parts, output), as_json)
@@ -174,7 +174,7 @@ def merge(parts: tuple[Path, ...], output: Path, as_json: bool) -> None:
     required=True,
     help="The training code of LagrangeBench or GNS, NumPy, or ParaView and all commands that read results.",
 )
-@click.option("-o", "--output", "directory", type=PATH, required=True, metavar="DIR", help="Where it goes.")
+@click.option("-o", "--output", "directory", type=PATH, required=True, metavar="DIR", help="Output directory.")
 @click.option("--trajectory", type=click.IntRange(min=0), metavar="N", help="Only the trajectory with this number.")
 @click.option("--stride", type=COUNT, default=1, show_default=True, metavar="K", help="Keep every K-th frame.")
 @click.option(
@@ -201,8 +201,8 @@ def merge(parts: tuple[Path, ...], output: Path, as_json: bool) -> None:
 def export_command(dataset: Path, quiet: bool, as_json: bool, **given: Any) -> None:
     """Write DATASET, a directory of trajectories or the result of one run, for training code or a viewer.
 
-    metadata.json beside the data holds bounds, spacings, and the statistics of displacements with which training code
-    normalises. The directory appears when it is complete.
+    metadata.json contains bounds, spacings, and the statistics of displacements that training code uses for
+    normalisation. The directory appears when it is complete.
     """
     from mpmcli.cli.progress import ProgressBar
     from mpmcli.dataset.dataset import open_dataset

@@ -28,7 +28,7 @@ def check_command(
 ) -> int:
     """Check a scene (PATH.toml): the stable step and its cause, likely faults, and the cost of the run.
 
-    Or check whether a result is stable and complete: its directory or particles.vtkhdf. Nothing is
+    PATH may also be a result, its directory or particles.vtkhdf: check whether it is stable and complete. Nothing is
     written. The exit code is 1 if there is an error, or with --strict a warning.
     """
     if path.suffix == ".toml":
@@ -42,7 +42,7 @@ def check_command(
         loaded = load_scene(path, overrides, laws=load_plugins(plugins))
         backend = Backend("cpu", threads or available_cores(), loaded.scene.solver.precision, compile_cache=True)
         check = check_scene(loaded, plan=make_plan(loaded.scene, backend), threads=threads)
-        # A scene that does not fit into memory is not run.
+        # Do not run a scene that does not fit into memory.
         if probe and not any(finding.rule == "memory" for finding in check.findings):
             from mpmcli.check.forecast import probe_scene
 
@@ -51,7 +51,7 @@ def check_command(
     else:
         given = {"--set": overrides, "--plugin": plugins, "--probe": probe, "--threads": threads}
         for option in (option for option, value in given.items() if value):
-            raise InputError(f"{option} is for scenes, and {path} is none; leave it out.")
+            raise InputError(f"{option} is for scenes, and {path} is not one; leave it out.")
         from mpmcli.check.result_check import check_result
 
         check = check_result(path)
@@ -71,13 +71,13 @@ def check_command(
 def info_command(
     path: Path, overrides: tuple[str, ...], plugins: tuple[Path, ...], verify: bool, as_json: bool
 ) -> int | None:
-    """Say what PATH holds: a scene (.toml), or a result (its directory or particles.vtkhdf).
+    """Describe PATH: a scene (.toml), or a result (its directory or particles.vtkhdf).
 
-    With --verify the exit code is 1 if anything has changed since it was written, or is missing.
+    With --verify the exit code is 1 if a file has changed since it was written, or is missing.
     """
     if verify:
         if path.suffix == ".toml" or overrides or plugins:
-            raise InputError(f"--verify is for results, datasets and exports, and {path} is none; leave it out.")
+            raise InputError(f"--verify is for results, datasets and exports, and {path} is not one; leave it out.")
         from mpmcli.dataset.dataset import is_dataset
         from mpmcli.dataset.export import is_export, verify_export
         from mpmcli.dataset.report import verify as verify_dataset
@@ -92,7 +92,7 @@ def info_command(
     else:
         if overrides or plugins:
             option = "--set changes" if overrides else "--plugin is for"
-            raise InputError(f"{option} scenes, and {path} is none; leave it out.")
+            raise InputError(f"{option} scenes, and {path} is not one; leave it out.")
         facts = _result_facts(path)
     if as_json:
         print_json(facts)
@@ -182,11 +182,11 @@ def _plain(value: object) -> str:
 @click.command("doctor", epilog="Example: mpmcli doctor")
 @json_option
 def doctor_command(as_json: bool) -> int:
-    """Say whether everything that mpmcli needs works on this machine.
+    """Test whether everything that mpmcli needs works on this machine.
 
-    Python, Taichi and its backends, VTK and its window, libraries, disk and memory are tried, each in a process of
-    its own, and get one line each, with the remedy where something is wrong. The exit code is 1 where something
-    needed is broken; a GPU that is not here is not.
+    Python, Taichi and its backends, VTK and its window, libraries, disk and memory are tested, each in a separate
+    process. Each gets one line, with a remedy for a fault. The exit code is 1 if a required part is broken; a missing
+    GPU is not a fault.
     """
     from mpmcli.doctor.examination import CHECKS, examine
 

@@ -1,4 +1,4 @@
-"""Ctrl-C, and the requests of a batch system or a closing terminal to end: what is written is sealed.
+"""Handles Ctrl-C, and termination requests of a batch system or a closing terminal; written data are sealed.
 
 SIGTERM and SIGHUP are treated like Ctrl-C (SIGINT). The exit code is 130 after SIGINT, and 143 after the others.
 """
@@ -15,7 +15,7 @@ _waits = False
 
 
 def leave_at_once() -> None:
-    """Let the signals end the process, with its exit codes: until there is anything to keep."""
+    """Let the signals end the process with its exit codes, as long as there are no data to keep."""
     for name in ("SIGINT", "SIGTERM", "SIGHUP"):
         number = getattr(signal, name, None)
         if number is not None and signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
@@ -25,7 +25,7 @@ def leave_at_once() -> None:
 def catch_interrupts() -> None:
     """Let the signals raise KeyboardInterrupt.
 
-    SIGTERM does also where a shell has switched Ctrl-C off (`mpmcli ... &`), and SIGHUP unless nohup was there first.
+    SIGTERM does so even if a shell has disabled Ctrl-C (`mpmcli ... &`); SIGHUP does so except under nohup.
     """
     global _came
     _came = 0
@@ -37,21 +37,21 @@ def catch_interrupts() -> None:
 
 
 def interrupt_came() -> str:
-    """Return the name of the signal that came first, or ""; modules in C may lose a KeyboardInterrupt."""
+    """Return the name of the first signal received, or ""; modules in C may lose a KeyboardInterrupt."""
     return signal.Signals(_came).name if _came else ""
 
 
 def interrupted_code() -> int:
-    """Return the exit code of a command that was interrupted."""
+    """Return the exit code of an interrupted command."""
     return INTERRUPTED if _came in (0, signal.SIGINT) else TERMINATED
 
 
 @contextmanager
 def interrupts_wait() -> Iterator[None]:
-    """Within this context the first signal raises nothing, for code that polls `interrupt_came` where it can stop.
+    """In this context the first signal raises no exception, for code that polls `interrupt_came` where it can stop.
 
-    An exception that comes between any two instructions may fall into a callback of a library, which loses it. A
-    second signal raises all the same.
+    An exception between any two instructions may occur in a callback of a library, which loses it. A second signal
+    raises in any case.
     """
     global _waits
     _waits = True

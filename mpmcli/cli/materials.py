@@ -19,10 +19,10 @@ WIDTH = 140
 
 @click.command("new", epilog="Example: mpmcli new dam_break_2d -o dam.toml")
 @click.argument("name", required=False)
-@output_option("The file to write; <NAME>.toml here by default.", "FILE.toml")
+@output_option("File to write; <NAME>.toml in the working directory by default.", "FILE.toml")
 @json_option
 def new_command(name: str | None, output: Path | None, as_json: bool) -> None:
-    """List the example scenes, or copy the one called NAME, to be changed.
+    """List the example scenes, or copy the one called NAME for editing.
 
     `mpmcli simulate NAME` runs one as it is.
     """

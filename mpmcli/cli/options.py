@@ -1,4 +1,4 @@
-"""Options that several commands share, and how wall times, sizes and lists of numbers are written in them."""
+"""Options shared by several commands, and parsers of wall times, sizes and lists of numbers."""
 
 import math
 import re
@@ -11,7 +11,7 @@ PATH = click.Path(path_type=Path)
 
 
 class SceneOrResult(click.Path):
-    """A path, or the name of an example scene where nothing of that name is there."""
+    """A path, or the name of an example scene if no file has that name."""
 
     def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> Path:
         path = super().convert(value, param, ctx)
@@ -54,18 +54,18 @@ quiet_option = click.option("-q", "--quiet", is_flag=True, help="Print nothing b
 
 
 def output_option(text: str, metavar: str = "DIR", name: str = "output") -> Callable:
-    """Return the option for the place of what is written; `name` is that of the parameter."""
+    """Return the option for the output path; `name` is that of the parameter."""
     return click.option("-o", "--output", name, type=PATH, metavar=metavar, help=text)
 
 
 def choice_option(flags: str, choices: list[str], default: str, text: str) -> Callable:
-    """Return an option that takes one of some words; `flags` may name the parameter after a space."""
+    """Return an option that takes one of several words; `flags` may name the parameter after a space."""
     return click.option(*flags.split(), type=click.Choice(choices), default=default, show_default=True, help=text)
 
 
 def arch_option(what: str) -> Callable:
     """Return the option for the backend; `what` begins its help."""
-    text = f"{what}; auto takes CUDA or Metal where they are, and else the CPU."
+    text = f"{what}; auto takes CUDA or Metal if available, else the CPU."
     return choice_option("--arch", ["auto", "cpu", "cuda", "vulkan", "metal"], "auto", text)
 
 
@@ -84,7 +84,7 @@ def duration(text: str) -> float:
     elif not _PARTS.sub("", text).strip():
         seconds = sum(float(number) * SECONDS[unit.lower()] for number, unit in _PARTS.findall(text))
     if not 0 < seconds < math.inf:
-        raise click.BadParameter(f"{text} is no time; give 2h, 90m, 45s, 1h30m or 1:30:00")
+        raise click.BadParameter(f"{text} is not a time; give 2h, 90m, 45s, 1h30m or 1:30:00")
     return seconds
 
 
@@ -94,7 +94,7 @@ def size(text: str) -> int:
     match = _SIZE.fullmatch(text)
     count = float(match[1]) * BYTES[match[2].lower()] if match else 0.0
     if not 1 <= count < 2**63:
-        raise click.BadParameter(f"{text} is no size; give 8GB, 500MB or 8GiB")
+        raise click.BadParameter(f"{text} is not a size; give 8GB, 500MB or 8GiB")
     return int(count)
 
 
@@ -102,13 +102,13 @@ def part(text: str) -> tuple[int, int]:
     """Read a part of the work, `i/n`."""
     first, slash, parts = text.partition("/")
     if not (slash and first.isdecimal() and parts.isdecimal() and 1 <= int(first) <= int(parts)):
-        raise click.BadParameter(f"{text} is no part; give 1/2 for the first of two")
+        raise click.BadParameter(f"{text} is not a part; give 1/2 for the first of two")
     return int(first), int(parts)
 
 
 def thread_counts(text: str) -> tuple[int, ...]:
-    """Read numbers of threads with commas between them, such as `1,2`."""
+    """Read comma-separated numbers of threads, such as `1,2`."""
     counts = [word.strip() for word in text.split(",")]
     if not all(count.isascii() and count.isdecimal() and 0 < int(count) < 10**6 for count in counts):
-        raise click.BadParameter(f"{text} is no number of threads; give 2, or 1,2 for each of both")
+        raise click.BadParameter(f"{text} is not a number of threads; give 2, or 1,2 for each of both")
     return tuple(dict.fromkeys(int(count) for count in counts))

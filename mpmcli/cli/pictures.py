@@ -14,24 +14,24 @@ from mpmcli.cli.streams import print_json, print_note, print_text
 from mpmcli.errors import InputError
 from mpmcli.render.settings import COLLIDERS, MODES, THEMES, parse_size
 
-# Of plot: the file by default, and the prefix of the digest in a picture of this command.
+# plot: the default file, and the prefix of the digest in a picture of this command.
 LEDGER = "ledger.png"
 MARK = "plot "
-# Of plot: pixels along each side, as smaller text is illegible and larger pictures are taken for a typing error; and
-# the largest width over the height.
+# plot: limits of the pixels along each side, because smaller text is illegible and larger pictures are probably a
+# typing error; and the largest ratio of width to height.
 SIZE_MIN, SIZE_MAX = 300, 8_000
 WIDEST = 3
 
 
 @click.command("render", epilog="Example: mpmcli render results/drop --mode surface --movie drop.mp4")
 @click.argument("result", type=SCENE)
-@output_option("A .png for one picture, or a directory; by default the directory render beside the result.", "OUT")
-@choice_option("--mode", MODES, "dots", "How particles are drawn.")
+@output_option("A .png for one picture, or a directory; by default the directory render next to the result.", "OUT")
+@choice_option("--mode", MODES, "dots", "Style of particles.")
 @click.option(
     "--frame",
     "frames",
     metavar="N|first|last|all|A:B:S",
-    help="Which frames; the last one by default, all of them for a film or a montage.",
+    help="Frames to draw; the last one by default, all for a film or a montage.",
 )
 @click.option(
     "--color-by",
@@ -47,14 +47,14 @@ WIDEST = 3
     default="iso",
     show_default=True,
     metavar="iso|front|side|top|x,y,z,x,y,z",
-    help="Of 3D scenes: by name, or where it stands and what it looks at, m.",
+    help="Camera of 3D scenes: a name, or its position and target, m.",
 )
-@choice_option("--theme", list(THEMES), "light", "Colours around the particles.")
+@choice_option("--theme", list(THEMES), "light", "Colours of background and text.")
 @choice_option(
     "--colliders",
     COLLIDERS,
     "auto",
-    "How colliders are drawn; clear: in 3D their far sides only, which hide nothing; auto: hollow ones are cut open.",
+    "Style of colliders; clear: in 3D only their far sides, which hide nothing; auto: hollow ones are cut open.",
 )
 @click.option("--movie", type=PATH, metavar="FILE", help="Make a film: .mp4 or .gif.")
 @click.option("--fps", type=float, help="Frames of the film per second, 30 by default.")
@@ -65,8 +65,8 @@ WIDEST = 3
     metavar="DIR",
     help="With --mode surface: write the surfaces for other tools, .vtp and .obj.",
 )
-@click.option("--workers", type=COUNT, help="Processes that render; as many as cores by default.")
-@click.option("--overwrite", is_flag=True, help="Render again what is there, and replace files that others made.")
+@click.option("--workers", type=COUNT, help="Number of processes; one per core by default.")
+@click.option("--overwrite", is_flag=True, help="Render existing pictures again, and replace files of other programs.")
 @quiet_option
 @json_option
 def render_command(result: Path, workers: int | None, quiet: bool, as_json: bool, **asked: Any) -> int:
@@ -76,11 +76,11 @@ def render_command(result: Path, workers: int | None, quiet: bool, as_json: bool
     <name of the scene>.png.
 
     RESULT may be a dataset: its montage shows evenly spaced trajectories at one frame, the middle one or --frame, and
-    goes to montage.png in the dataset.
+    is written to montage.png in the dataset.
 
-    RESULT is a directory, or particles.vtkhdf, of a run that has ended or goes on. A picture that is
-    there and still right is not made again. The path of each picture, or that of the film, and the directory of the
-    surfaces are printed on stdout.
+    RESULT is a directory, or particles.vtkhdf, of a run that has ended or is running. Existing pictures that are up to
+    date are not drawn again. The path of each picture, or that of the film, and the directory of the surfaces are
+    printed on stdout.
     """
     from mpmcli.cli.progress import ProgressBar
     from mpmcli.dataset.dataset import is_dataset
@@ -126,17 +126,17 @@ def render_command(result: Path, workers: int | None, quiet: bool, as_json: bool
 @click.argument("result", type=PATH)
 @output_option(f"The picture; {LEDGER} in the directory of the result by default.", "OUT.png")
 @choice_option("--theme", ["light", "dark"], "light", "Colours.")
-@click.option("--size", default="1200x900", show_default=True, metavar="WxH", help="Pixels; text grows with them.")
+@click.option("--size", default="1200x900", show_default=True, metavar="WxH", help="Pixels; the text scales with them.")
 @click.option("--overwrite", is_flag=True, help="Replace a file that this command did not make.")
 @quiet_option
 @json_option
 def plot_command(
     result: Path, output: Path | None, theme: str, size: str, overwrite: bool, quiet: bool, as_json: bool
 ) -> None:
-    """Draw the ledger of RESULT: its directory or particles.vtkhdf, also while it is being written.
+    """Draw the ledger of RESULT, its directory or particles.vtkhdf, also during the run.
 
-    Energies, the momentum that walls and forces gave, the time step and what bounds it, Courant number, volumes, the
-    largest speed, and how far the particles reach.
+    The panels show energies, momentum from walls and forces, time step and its binding limit, Courant number, volumes,
+    largest speed, and extent of the particles.
     """
     from mpmcli.output import open_result
     from mpmcli.plot.ledger_figure import ledger_picture, read_history
@@ -156,7 +156,7 @@ def plot_command(
     opened = open_result(result)
     path = output or (opened.path if opened.path.is_dir() else opened.path.parent) / LEDGER
     if path.suffix.lower() != ".png":
-        raise InputError(f"{path} would be no picture of this command: give a name that ends in .png.")
+        raise InputError(f"{path} cannot be a picture of this command: give a name that ends in .png.")
     digest = digest_of(path)
     if digest is not None and not digest.startswith(MARK) and not overwrite:
         raise InputError(f"{path} is there and was not made by mpmcli plot: give another name, or --overwrite.")

@@ -1,4 +1,4 @@
-"""The group of all commands, loaded when named, and what every one of them does with an error."""
+"""The group of all commands, which are loaded on use, and the handling of errors common to all."""
 
 import errno
 import importlib
@@ -15,7 +15,7 @@ from mpmcli.cli.streams import flush_streams, print_error
 from mpmcli.cli.supervisor import may_supervise, supervise
 from mpmcli.errors import MpmcliError
 
-# Name of each command, the module that holds it as NAME_command, and its line in the help, which so loads no module.
+# Name of each command, the module with its NAME_command, and its help line, so that help loads no modules.
 COMMANDS = {
     "simulate": ("simulate", "Run a scene and store its particles."),
     "new": ("materials", "List the example scenes, or copy one."),
@@ -35,12 +35,12 @@ COMMANDS = {
     "completion": ("program", "Print the script that completes commands in a shell."),
 }
 
-# Faults of the disk, which any file may meet.
+# Faults of the disk that any file may meet.
 DISK_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)
 
 
 class LazyGroup(click.Group):
-    """A group whose commands are imported when they are called."""
+    """A group whose commands are imported on use."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(COMMANDS)
@@ -72,8 +72,8 @@ class LazyGroup(click.Group):
 def program(context: click.Context, debug: bool) -> None:
     """Turn a TOML scene into a reproducible particle dataset with the Material Point Method.
 
-    What a command was asked for goes to stdout; progress, warnings and errors go to stderr. Exit codes: 0 done;
-    1 done, with a finding; 2 bad input or usage; 130 interrupted; 143 ended by SIGTERM or SIGHUP.
+    Answers go to stdout; progress, warnings and errors go to stderr. Exit codes: 0 done; 1 done, with a finding; 2 bad
+    input or usage; 130 interrupted; 143 ended by SIGTERM or SIGHUP.
     """
     context.obj = debug
     if context.invoked_subcommand is None:
@@ -93,7 +93,7 @@ def completion_command(shell: str) -> None:
 
 
 def main(arguments: list[str] | None = None) -> NoReturn:
-    """Run the command line, `sys.argv` where no arguments are given, and exit with its code."""
+    """Run the command line, `sys.argv` by default, and exit with its code."""
     words = sys.argv[1:] if arguments is None else arguments
     code = supervise(lambda: run(words)) if may_supervise(words) else run(words)
     flush_streams()
@@ -101,10 +101,10 @@ def main(arguments: list[str] | None = None) -> NoReturn:
 
 
 def run(arguments: list[str]) -> int:
-    """Run the command line and return its exit code; a traceback is shown with --debug only."""
+    """Run the command line and return its exit code; only --debug shows a traceback."""
     catch_interrupts()
     debug = "--debug" in arguments
-    # Accepted after the command too.
+    # Also accepted after the command.
     arguments = (["--debug"] if debug else []) + [word for word in arguments if word != "--debug"]
     try:
         result = program.main(arguments, prog_name="mpmcli", standalone_mode=False)
@@ -124,7 +124,7 @@ def run(arguments: list[str]) -> int:
         print_error(f"error: {error}")
         return error.exit_code
     except (BrokenPipeError, SystemExit):
-        # The reader of stdout or stderr has closed it, as in `mpmcli materials | head -1`. click and rich exit then.
+        # The reader of stdout or stderr has closed it, as in `mpmcli materials | head -1`; click and rich then exit.
         return 0
     except Exception as error:
         if interrupt_came():
@@ -140,7 +140,7 @@ def run(arguments: list[str]) -> int:
             print_error("error: the working directory no longer exists: go to another one.")
             return 2
         kind = type(error).__name__
-        # On a bare machine a library of the system may be missing, which a package of ours loads.
+        # On a bare machine a system library that a package loads may be missing.
         of_system = isinstance(error, ImportError) and not (error.name or "").startswith("mpmcli")
         whose = "mpmcli doctor says what is missing" if of_system else "a fault of mpmcli"
         print_error(f"error: {kind}: {error} ({whose}; --debug shows where)")

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 class ProgressBar:
     """A progress bar of `total` units ("frames") with messages above it, as a context; `quiet` prints nothing.
 
-    `pause` is the least time between plain lines, s; `steady` units show the time left, others that elapsed.
+    `pause` is the shortest time between plain lines, s; `steady` units show the time left, others the time elapsed.
     """
 
     def __init__(self, total: int, unit: str, *, quiet: bool, pause: float = 5.0, steady: bool = True) -> None:
@@ -64,7 +64,7 @@ class ProgressBar:
             self.say(f"{done}/{self._total} {self._unit}" + (f": {said}" if said else ""))
 
     def say(self, line: str) -> None:
-        """Print a line; a terminal gets it broken between words."""
+        """Print a line; on a terminal it is wrapped between words."""
         if self._quiet:
             return
         try:
@@ -107,7 +107,7 @@ class SimulateProgress(ProgressBar):
         """Show one more stored frame."""
         done = summary.steps - summary.steps_before
         if summary.frames < 2 or done < 1:
-            return  # the kernels compile in the first step, or a frame was left from before
+            return  # the kernels compile in the first step, or the frame is of an earlier process
         taken = summary.timings["solve_s"] + summary.timings["output_s"]
         steps_left = max(self._end - summary.time, 0.0) / row.step_max
         left = taken / done * steps_left
@@ -135,7 +135,7 @@ class ValidateProgress(ProgressBar):
         return super().__enter__()
 
     def advance(self, run: "Run", result: "RunResult", done: int) -> None:
-        """Show one more run that has ended."""
+        """Show another finished run."""
         what = f"{run.case}, n = {run.n}, {run.setting.label}"
         if result.finished:
             measure = self._measures[run.case]

@@ -17,24 +17,24 @@ from mpmcli.errors import InputError
 
 @click.command("simulate", epilog="Example: mpmcli simulate drop.toml -o results/drop --set time.end=2")
 @click.argument("scene", type=SCENE)
-@options.output_option("Where the result goes; results/<name of the scene> by default.", name="directory")
+@options.output_option("Directory of the result; results/<name of the scene> by default.", name="directory")
 @options.set_option
 @options.plugin_option
 @options.arch_option("Where to compute")
 @click.option("--threads", type=COUNT, help="CPU threads; by default one for each 2,500 particles.")
 @click.option("--precision", type=click.Choice(["f32", "f64"]), help="Replaces solver.precision of the scene.")
 @options.choice_option(
-    "--format form", ["vtkhdf", "vtk"], "vtkhdf", "One temporal VTKHDF file; vtk: a .vtu series with a .pvd beside it."
+    "--format form", ["vtkhdf", "vtk"], "vtkhdf", "One temporal VTKHDF file; vtk: also a .vtu series with a .pvd."
 )
 @click.option("--compress", is_flag=True, help="Compress the stored file with gzip.")
 @click.option("--overwrite", is_flag=True, help="Replace an earlier result in the output directory.")
-@click.option("--resume", is_flag=True, help="Go on with the run in the output directory, from its newest checkpoint.")
+@click.option("--resume", is_flag=True, help="Continue the run in the output directory from its newest checkpoint.")
 @click.option(
     "--checkpoint",
     "checkpoint_every",
     type=click.FloatRange(min=0),
     metavar="SECONDS",
-    help="Wall time between two checkpoints; by default as often as takes less than 1 % of it.",
+    help="Wall time between two checkpoints; by default they take less than 1 % of it.",
 )
 @click.option(
     "--force", is_flag=True, help="Run although `mpmcli check` finds errors, and take time.step above the stable step."
@@ -44,7 +44,7 @@ from mpmcli.errors import InputError
     "--max-memory",
     type=options.size,
     metavar="SIZE",
-    help="End the run before it takes more memory of this machine: 8GB, 500MB or 8GiB.",
+    help="End the run before it uses more memory of this machine: 8GB, 500MB or 8GiB.",
 )
 @quiet_option
 @json_option
@@ -85,13 +85,13 @@ def simulate_command(scene: Path, precision: str | None, quiet: bool, as_json: b
 @click.argument("scenes", type=SCENE, nargs=-1, required=True)
 @options.arch_option("Where they will be computed")
 @click.option("--threads", type=COUNT, help="CPU threads; by default as many as `mpmcli simulate` takes.")
-@click.option("--jobs", type=COUNT, help="Processes at once; one for each core by default.")
+@click.option("--jobs", type=COUNT, help="Number of processes; one per core by default.")
 @json_option
 def warm_command(scenes: tuple[Path, ...], arch: str, threads: int | None, jobs: int | None, as_json: bool) -> int:
-    """Compile the kernels of SCENES, TOML files, so that runs of them on this machine start at once.
+    """Compile the kernels of SCENES, TOML files, so that their runs on this machine start without compilation.
 
-    For an installation, for jobs of a CI that keep the folder of compiled kernels, and for the nodes of a cluster. The
-    exit code is 1 if a scene could not be compiled.
+    Use it after an installation, in CI jobs that keep the folder of compiled kernels, and on the nodes of a cluster.
+    The exit code is 1 if a scene could not be compiled.
     """
     from mpmcli.cores import available_cores
     from mpmcli.materials.registry import parameter_models

@@ -14,7 +14,7 @@ from mpmcli.plain_text import escaped
 
 
 def print_answer(answer: Any, as_json: bool, *, quiet: bool = False) -> None:
-    """Print what has `as_dict` and `text` on stdout, as JSON or as text; no text if quiet."""
+    """Print an object with `as_dict` and `text` on stdout, as JSON or as text; no text if quiet."""
     if as_json:
         print_json(answer.as_dict())
     elif not quiet:
@@ -30,10 +30,10 @@ def print_json(content: object) -> None:
 
 
 def print_text(text: str) -> None:
-    """Print a text, control characters escaped; a closed pipe is no error, RunError a closed stdout or a full disk."""
+    """Print a text with control characters escaped, ignoring a closed pipe; RunError: stdout is closed or disk full."""
     try:
         click.echo(escaped(text))
-        # click writes nothing, and raises nothing, where there is no stdout.
+        # Without a stdout, click writes nothing and raises nothing.
         sys.stdout.flush()
     except BrokenPipeError:
         _discard(sys.stdout)
@@ -50,15 +50,15 @@ def print_note(text: str) -> None:
 
 
 def print_error(text: str) -> None:
-    """Print an error on stderr, where somebody still reads it."""
+    """Print an error on stderr, unless its reader has closed it."""
     with suppress(OSError, ValueError, AttributeError):
         print_note(text)
 
 
 def flush_streams() -> None:
-    """Flush stdout and stderr, and discard what cannot be written.
+    """Flush stdout and stderr, and discard text that cannot be written.
 
-    Python flushes both at exit, and changes the exit code to 120 where that fails.
+    Python flushes both at exit, and changes the exit code to 120 if that fails.
     """
     for stream in (sys.stdout, sys.stderr):
         try:
@@ -68,7 +68,7 @@ def flush_streams() -> None:
 
 
 def _discard(stream: IO[str] | None) -> None:
-    """Send what is buffered, and all that follows, to the null device."""
+    """Redirect buffered and later output to the null device."""
     with suppress(OSError, AttributeError, ValueError):
         null = os.open(os.devnull, os.O_WRONLY)
         os.dup2(null, stream.fileno())

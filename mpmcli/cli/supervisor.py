@@ -1,8 +1,8 @@
-"""The process that a user starts: it passes signals to the one that computes, and ends that one where it takes long.
+"""The process that a user starts: it passes signals to a child process, and kills a child that takes long to end.
 
-Python attends to a signal between two instructions. Compiling kernels, a step of a large scene, or a film in a library
-may take longer than a batch system waits, and no code of the same process can do anything meanwhile. So commands that
-take long run in a child process. What a user sees is one process: exit codes, signals, and the time of its end.
+Python handles a signal between two instructions. Compilation of kernels, a step of a large scene, or a film in a
+library may take longer than a batch system waits, and no code of the same process can act meanwhile. Therefore commands
+that take long run in a child process. Exit codes, signals and the time of the end are as of a single process.
 """
 
 import ctypes
@@ -21,9 +21,9 @@ from mpmcli.cli.streams import flush_streams, print_error
 
 # Commands that may take long.
 LONG = ("simulate", "sweep", "render", "validate", "export", "dataset", "plot")
-# Time from the first and from a second signal to the end by force, s.
+# Time from the first and from a second signal to the kill, s.
 PATIENCE, LITTLE = 3.5, 0.5
-# Time from the first signal to the preparations for that end, s.
+# Time from the first signal to the preparations for the kill, s.
 SOON = 1.0
 REQUESTS = ("SIGINT", "SIGTERM", "SIGHUP")
 # Linux: the signal that a process gets when its parent is gone (prctl).
@@ -33,14 +33,14 @@ _announced: int | None = None
 
 
 def may_supervise(arguments: Sequence[str]) -> bool:
-    """Return whether a command line is to run in a child process; --debug keeps it in this one."""
+    """Return whether a command line runs in a child process; --debug keeps it in this one."""
     first = next((word for word in arguments if not word.startswith("-")), "")
     asks = {"-h", "--help", "--debug"} & set(arguments)
     return first in LONG and not asks and hasattr(os, "fork") and hasattr(signal, "sigtimedwait")
 
 
 def supervise(work: Callable[[], int]) -> int:
-    """Do work in a child process and return its exit code; a signal that kills the child kills this process too."""
+    """Run `work` in a child process and return its exit code; a signal that kills the child kills this process too."""
     global _announced
     # Ignored ones, as in `mpmcli ... &` or under nohup, stay ignored.
     requests = {
@@ -54,7 +54,7 @@ def supervise(work: Callable[[], int]) -> int:
     if not child:
         os.close(told)
         _announced = tells
-        # Ctrl-C at the terminal goes to the supervisor alone.
+        # Only the supervisor receives Ctrl-C of the terminal.
         with suppress(OSError):
             os.setpgid(0, 0)
         if sys.platform == "linux":
@@ -65,17 +65,17 @@ def supervise(work: Callable[[], int]) -> int:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
         code = work()
         flush_streams()
-        # As after `sys.exit`; the caller must not go on in two processes.
+        # As after `sys.exit`; the caller must not continue in two processes.
         sys.exit(code)
     os.close(tells)
     with suppress(OSError):
         os.setpgid(child, child)
-    # The signals stay blocked: what comes now is too late.
+    # The signals stay blocked: any that arrive now are too late.
     return _attend(child, requests, watched, told)
 
 
 def announce(directory: Path) -> None:
-    """Tell the supervisor which result this process is about to write, in order to close it after an end by force."""
+    """Tell the supervisor which result this process is about to write, so that it can close it after a kill."""
     if _announced is None:
         return
     place = directory.absolute()
@@ -95,7 +95,7 @@ def _attend(child: int, requests: set[signal.Signals], watched: set[signal.Signa
             pause = deadline - time.monotonic()
             came = signal.sigtimedwait(watched, max(0.0, pause if ready else min(pause, SOON)))
         if came is None and not ready:
-            # What is needed then takes a while to load.
+            # Load the modules for the kill, which takes time.
             for name in ("psutil", "mpmcli.output.directory"):
                 importlib.import_module(name)
             ready = True
@@ -105,7 +105,7 @@ def _attend(child: int, requests: set[signal.Signals], watched: set[signal.Signa
 
             with suppress(psutil.Error):
                 process = psutil.Process(child)
-                # Stopped, it starts no more.
+                # A stopped child starts no further work.
                 process.suspend()
                 for one in [*process.children(recursive=True), process]:
                     with suppress(psutil.Error):
@@ -129,7 +129,7 @@ def _attend(child: int, requests: set[signal.Signals], watched: set[signal.Signa
         else:
             ended, status = os.waitpid(child, os.WNOHANG)
             if ended and first is not None and os.WIFSIGNALED(status):
-                # It came where Python is not ready for it, as at its end.
+                # It arrived at a time when Python cannot handle it, for example at exit.
                 return _interrupted(child, told, first)
             if ended:
                 return _code(status)
@@ -145,7 +145,7 @@ def _code(status: int) -> int:
         name = f"signal {number}"
     if number == signal.SIGKILL:
         print_error(
-            "error: the process was killed (SIGKILL), perhaps for want of memory; what it had reported is kept."
+            "error: the process was killed (SIGKILL), perhaps for lack of memory; what it had reported is kept."
         )
         os.kill(os.getpid(), signal.SIGKILL)
     print_error(f"error: the process crashed ({name}); what it had reported is kept.")
@@ -153,7 +153,7 @@ def _code(status: int) -> int:
 
 
 def _interrupted(child: int, told: int, first: signal.Signals) -> int:
-    """Write into run.json how the run ended that the child was writing, or remove it where it has no frame."""
+    """Record the end of the child's run in run.json, or remove a result without frames."""
     from mpmcli.errors import MpmcliError
 
     os.set_blocking(told, False)

@@ -26,18 +26,18 @@ if TYPE_CHECKING:
     "--levels level",
     ["coarse", "default", "fine"],
     "default",
-    "Resolutions, and what is varied: coarse takes minutes, default up to an hour, fine more.",
+    "Resolutions and settings: coarse takes minutes, default up to an hour, fine more.",
 )
-@output_option("Where report.md, its figures and the results go; without it nothing is written.")
-@click.option("--workers", type=COUNT, help="Runs at a time, one thread each; as many as cores by default.")
+@output_option("Directory of report.md, its figures and the results; without it nothing is written.")
+@click.option("--workers", type=COUNT, help="Number of parallel runs, one thread each; one per core by default.")
 @click.option(
     "--timeout", type=click.FloatRange(min=1.0), default=1800.0, show_default=True, help="Seconds that a run may take."
 )
-@click.option("--resume", is_flag=True, help="Go on in the output directory: runs that still hold are not done again.")
+@click.option("--resume", is_flag=True, help="Continue in the output directory: valid runs are not repeated.")
 @click.option("--overwrite", is_flag=True, help="Replace the report and all runs in the output directory.")
 @click.option("--list", "listing", is_flag=True, help="List the cases and run nothing.")
 @click.option("--write-scene", is_flag=True, help="Print the scene of a case as TOML and run nothing.")
-@click.option("--resolution", type=COUNT, metavar="N", help="Of --write-scene; the coarsest by default.")
+@click.option("--resolution", type=COUNT, metavar="N", help="Resolution of --write-scene; the coarsest by default.")
 @quiet_option
 @json_option
 def validate_command(
@@ -45,10 +45,9 @@ def validate_command(
 ) -> int:
     """Measure speed against error on problems with known answers.
 
-    Each CASE, all of them by default, is run at several resolutions and with several settings, each in a process of
-    its own, and judged. A name may be short: bar means every case whose name begins with bar_.
-
-    Exit code 1 where a case is out of tolerance.
+    Each CASE, all of them by default, is run at several resolutions and with several settings, each run in a separate
+    process, and compared with its tolerances. A name may be short: bar means every case whose name begins with bar_.
+    The exit code is 1 if a case is out of tolerance.
     """
     resume, overwrite, resolution = asked["resume"], asked["overwrite"], asked["resolution"]
     if resolution is not None and not asked["write_scene"]:
@@ -103,7 +102,7 @@ def validate_command(
 def _study(
     cases: Sequence["Case"], level: "Level", workers: int, timeout: float, journal: "Journal | None", quiet: bool
 ) -> "Report":
-    """Run what the journal does not have, and return the report; KeyboardInterrupt where it was interrupted."""
+    """Run the cases that the journal lacks, and return the report; KeyboardInterrupt: interrupted."""
     from mpmcli.bench.report import describe_machine
     from mpmcli.cli.progress import ValidateProgress
     from mpmcli.validation.report import Report
@@ -162,8 +161,8 @@ def _list(cases: Sequence["Case"], level: "Level", as_json: bool) -> None:
 
 
 @click.command("bench", epilog="Example: mpmcli bench --case 2d-64 --threads 1")
-@click.option("--dataset", is_flag=True, help="Measure instead how many trajectories an hour a sweep makes.")
-@click.option("--profile", is_flag=True, help="Measure instead what sort, P2G, grid and G2P take, for each law.")
+@click.option("--dataset", is_flag=True, help="Measure the trajectories per hour of a sweep instead.")
+@click.option("--profile", is_flag=True, help="Measure the times of sort, P2G, grid and G2P for each law instead.")
 @click.option("--case", "names", multiple=True, metavar="NAME", help="Only this case, e.g. 3d-128. May be repeated.")
 @click.option(
     "--threads", type=thread_counts, metavar="NUMBERS", help="CPU threads: 2, or in turn 1,2; by default all."
@@ -184,13 +183,13 @@ def bench_command(
 ) -> int:
     """Compare speed with the MPM examples that the taichi package ships.
 
-    All sides run the same fluid block: equal particles, grid, step and precision, in turn (A B A B), and medians are
-    printed: particle-steps per second, start-up and compile time. Each may use all threads; mpmcli takes one for each
-    2,500 particles, as mpmcli simulate does. Where gcc is, a block in C, with vectors of four numbers, tells how far
-    the limit of the processor is.
+    All programs run the same fluid block, with equal particles, grid, step and precision, in alternation (A B A B).
+    Medians are printed of particle-steps per second, start-up and compile time. Each may use all threads; mpmcli uses
+    one for each 2,500 particles, as mpmcli simulate does. If gcc is installed, a block in C, with vectors of four
+    numbers, shows the distance from the limit of the processor.
 
     With --dataset, a sweep of 1,444 particles of sand and 350 frames is computed and stored, by one worker and by one
-    on each of --threads cores in turn: trajectories per hour, and their ratio to the generator of the GNS project.
+    per core on --threads cores, in turn: trajectories per hour, and their ratio to the generator of the GNS project.
 
     With --profile, each law: ns per particle and step of the sort, P2G, the grid, G2P, and measuring the state.
     """
@@ -226,7 +225,7 @@ def bench_command(
 
 
 def _named(known: tuple, names: tuple[str, ...]) -> list:
-    """Return the cases that were asked for; InputError: one is not among them."""
+    """Return the requested cases; InputError: one does not exist."""
     there = [case.name for case in known]
     if unknown := [name for name in names if name not in there]:
         raise InputError(f'there is no case "{unknown[0]}"; the cases are {", ".join(there)}.')

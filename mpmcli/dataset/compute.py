@@ -1,4 +1,4 @@
-"""What workers of a sweep do: draw, run and store trajectories; and the Dask cluster that sends them tasks."""
+"""Workers of a sweep, which draw, run and store trajectories, and the Dask cluster that sends them tasks."""
 
 import hashlib
 import json
@@ -35,32 +35,32 @@ from mpmcli.simulation.runner import Recording, Runner
 if TYPE_CHECKING:
     from distributed import LocalCluster
 
-# Runs of a trajectory with half the step of the one before, after the first.
+# Number of retries of a trajectory, each with half the step of the previous run.
 RETRIES = 2
-# Trajectories that a worker draws before its first run, to know how many particles it needs room for.
+# Trajectories that a worker draws before its first run, to determine the particle capacity.
 LOOK_AHEAD = 32
-# Tasks under way for each worker: one to compute, and one that waits for it.
+# Tasks in flight per worker: one being computed and one waiting.
 AHEAD = 2
 # Attempts to start a cluster.
 STARTS = 3
-# Seconds between looks at `stop`.
+# Seconds between calls of `stop`.
 PATIENCE = 0.2
 _SETTINGS = {
     # Workers that a task may lose before it counts as failed.
     "distributed.scheduler.allowed-failures": 5,
-    # A step of a large scene holds the interpreter for longer than Dask expects.
+    # A step of a large scene blocks the interpreter for longer than Dask expects.
     "distributed.admin.tick.limit": "1h",
     "distributed.comm.timeouts.connect": "30s",
-    # Samples of every thread, a hundred a second, which nobody sees.
+    # Dask's profiler samples every thread a hundred times a second; its result is not used.
     "distributed.worker.profile.enabled": False,
 }
 
 
 @dataclass(frozen=True)
 class Task:
-    """Trajectories of the dataset in a directory, for a worker with this backend and further laws from files.
+    """Trajectories of the dataset in a directory, for a worker with this backend and plugin laws from files.
 
-    sources: of each file that scenes read its absolute path and its digest.
+    sources: absolute path and digest of each file that scenes read.
     """
 
     directory: Path
@@ -73,9 +73,9 @@ class Task:
 
 
 def compute(task: Task) -> list[Row]:
-    """Compute trajectories, and return their rows for the manifest; a RunError says that a file could not be written.
+    """Compute trajectories, and return their rows for the manifest; RunError: a file could not be written.
 
-    Taichi belongs to the thread that started it, and Dask's threads come and go.
+    Taichi must stay in the thread that started it, but Dask's threads come and go.
     """
     return _thread().submit(_compute, task).result()
 
@@ -85,7 +85,7 @@ _kept = threading.local()
 
 
 def _runner(task: Task) -> Runner:
-    """Return the runner of this process, whose kernels outlive a task."""
+    """Return the runner of this process, whose kernels are kept between tasks."""
     known = (task.sweep.key, task.arch, task.threads, task.plugins, task.sources)
     if getattr(_kept, "known", None) != known:
         for path, digest in task.sources:
@@ -99,7 +99,7 @@ def _runner(task: Task) -> Runner:
         _kept.runner = Runner(task.arch, task.threads)
         scenes = []
         for number in range(min(task.sweep.count, LOOK_AHEAD)):
-            # One that cannot be drawn gets its row when its turn comes.
+            # A trajectory that cannot be drawn gets its row in its turn.
             with suppress(InputError):
                 scenes.append(draw(task.sweep, number).scene(_kept.laws).scene)
         _kept.runner.expect(scenes)
@@ -109,7 +109,7 @@ def _runner(task: Task) -> Runner:
 
 @dataclass
 class _Trial:
-    """A trajectory under way: its row as far as known, its draw, and its scene."""
+    """A trajectory in progress: its row as far as known, its draw, and its scene."""
 
     row: Row
     drawn: Draw
@@ -117,9 +117,9 @@ class _Trial:
 
 
 def _compute(task: Task) -> list[Row]:
-    """Draw trajectories, run each until its verdict is accepted or no retry is left, and store them."""
+    """Draw trajectories, run each until its verdict is accepted or no retries are left, and store them."""
     began = time.perf_counter()
-    # A backend that is not there ends the sweep, not a trajectory.
+    # A missing backend ends the sweep, not only a trajectory.
     _runner(task)
     rows: dict[int, Row] = {}
     waiting: list[_Trial] = []
@@ -142,7 +142,7 @@ def _compute(task: Task) -> list[Row]:
         for place, outcome in _runner(task).run_all(scenes):
             trial = waiting[place]
             now = time.perf_counter()
-            # Of several at once each has its share.
+            # Trajectories computed together share the time equally.
             trial.row = replace(trial.row, seconds=trial.row.seconds + now - began)
             began = now
             if isinstance(outcome, Recording):
@@ -168,7 +168,7 @@ def _compute(task: Task) -> list[Row]:
 
 
 def _failed(row: Row, error: Exception) -> Row:
-    """Return the row of a trajectory that has failed, without ending others; after a fault the device is emptied."""
+    """Return the row of a failed trajectory, so that others continue; after a fault of mpmcli, clear the device."""
     if isinstance(error, InputError):
         return replace(row, reason=str(error))
     _kept.known = None
@@ -176,7 +176,7 @@ def _failed(row: Row, error: Exception) -> Row:
 
 
 def scene_fault(loaded: LoadedScene) -> str:
-    """Return the first error that a check finds in a scene, "" where there is none."""
+    """Return the first error that a check finds in a scene, "" if there is none."""
     return next((finding.what for finding in check_scene(loaded).findings if finding.severity == "error"), "")
 
 
@@ -209,7 +209,7 @@ def _stored(task: Task, row: Row, drawn: Draw, scene: Scene, run: Recording, ret
 
 
 def trajectory_data(drawn: Draw, run: Recording) -> TrajectoryData:
-    """Return the frames of a run, which has at least one, as arrays over time."""
+    """Return the frames of a run, at least one, as arrays over time."""
     frames, first = run.frames, run.frames[0]
     return TrajectoryData(
         number=drawn.number,
@@ -226,14 +226,14 @@ def trajectory_data(drawn: Draw, run: Recording) -> TrajectoryData:
 
 
 class Workers:
-    """Workers that compute tasks, as `local_workers` and `joined_workers` give them."""
+    """Workers that compute tasks, from `local_workers` or `joined_workers`."""
 
     def __init__(self, client: object) -> None:
         self._client = client
         self.count = len(client.scheduler_info(n_workers=-1)["workers"])
 
     def outcomes(self, tasks: Iterable[Task], stop: Callable[[], bool]) -> Iterator[tuple[Task, list[Row] | None]]:
-        """Yield tasks with rows as they end, None where no worker survived; RunError: a write failed, or no cluster."""
+        """Yield each task with its rows as it ends, None if no worker survived; RunError: write or cluster failed."""
         from distributed import Future
         from distributed.scheduler import KilledWorker
 
@@ -268,7 +268,7 @@ class Workers:
             elif not isinstance(error, KilledWorker):
                 raise error
             elif len(task.numbers) > 1:
-                # One of them takes its worker with it; which one, the next tries tell.
+                # One of the trajectories kills its worker; separate attempts find it.
                 yield from self.outcomes([replace(task, numbers=(number,)) for number in task.numbers], stop)
             else:
                 yield task, None
@@ -276,14 +276,14 @@ class Workers:
 
 @contextmanager
 def local_workers(count: int) -> Iterator[Workers]:
-    """Start workers on this machine, one process each, that end with the block."""
+    """Start workers on this machine, one process each; they end with the block."""
     from distributed import Client
 
     with _quiet_dask(), _local_cluster(count) as cluster, Client(cluster) as client:
         try:
             yield Workers(client)
         except BaseException:
-            # A worker hears of nothing while a kernel runs; what it writes is whole or absent.
+            # A worker receives no messages while a kernel runs; its files are whole or absent.
             for nanny in cluster.workers.values():
                 nanny.auto_restart = False
                 with suppress(OSError, AttributeError, TypeError):
@@ -293,7 +293,7 @@ def local_workers(count: int) -> Iterator[Workers]:
 
 @contextmanager
 def _quiet_dask() -> Iterator[None]:
-    """Let Dask say nothing: a connection that is closed has a traceback, even after the cluster has ended."""
+    """Silence Dask, which logs a traceback for a closed connection even after the cluster has ended."""
     import dask
 
     for name in ("distributed", "distributed.client"):
@@ -304,7 +304,7 @@ def _quiet_dask() -> Iterator[None]:
 
 
 def _local_cluster(count: int) -> "LocalCluster":
-    """Start a cluster; again, where a worker was killed before it had started, which Dask does not forgive."""
+    """Start a cluster; retry if a worker was killed during its start, from which Dask does not recover."""
     from distributed import LocalCluster
 
     for left in reversed(range(STARTS)):
@@ -315,7 +315,7 @@ def _local_cluster(count: int) -> "LocalCluster":
                     threads_per_worker=1,
                     processes=True,
                     memory_limit=None,
-                    # The status pages that Dask serves: for this machine only, on a free port.
+                    # Dask's status pages: for this machine only, on a free port.
                     dashboard_address="127.0.0.1:0",
                     silence_logs="CRITICAL",
                 )
@@ -327,7 +327,7 @@ def _local_cluster(count: int) -> "LocalCluster":
 
 @contextmanager
 def joined_workers(address: str) -> Iterator[Workers]:
-    """Use the workers of a running scheduler; they see the dataset at the same path."""
+    """Use the workers of a running scheduler; they must see the dataset at the same path."""
     from distributed import Client
 
     with _quiet_dask():

@@ -1,4 +1,4 @@
-"""Reading a dataset: its trajectories by number, with arrays that are read when they are asked for."""
+"""Reads a dataset: its trajectories by number, with arrays that are read on access."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
@@ -23,11 +23,10 @@ ALL = slice(None)
 
 
 class Trajectory(ABC):
-    """T frames of the same N particles. No file stays open, so it can be copied to other processes.
+    """T frames of the same N particles. No file stays open, so that it can be copied to other processes.
 
     Attributes:
-        number: in the dataset; split: "train", "valid" or "test".
-        draws: what was drawn for it, by the key of the scene.
+        number: number in the dataset; split: "train", "valid" or "test". draws: drawn values, by the key of the scene.
         header: facts about the run.
         times: (T,) float64, s.
         steps, frames: (T,) int64, time steps since the start, and number of each frame in its run.
@@ -46,12 +45,12 @@ class Trajectory(ABC):
 
     @property
     def colliders(self) -> tuple[Collider, ...]:
-        """The colliders that are known."""
+        """The known colliders."""
         return as_they_moved(self.header.colliders, self)
 
     @property
     def frame_count(self) -> int:
-        """T."""
+        """Number of frames, T."""
         return len(self.times)
 
     @property
@@ -82,7 +81,7 @@ class Trajectory(ABC):
         """Read some frames of some particles of an array.
 
         Args:
-            name: "position", "velocity", a field, or, for which `frames` does not matter, "body" or "material".
+            name: "position", "velocity", a field, or "body" or "material", for which `frames` is ignored.
             frames: a slice with a positive step.
             particles: a slice, or indices.
 
@@ -112,7 +111,7 @@ class Trajectory(ABC):
 
     @abstractmethod
     def _read(self, name: str, frames: slice) -> np.ndarray:
-        """Read some frames of all particles of an array that is there."""
+        """Read some frames of all particles of an existing array."""
 
 
 class _StoredTrajectory(Trajectory):
@@ -142,7 +141,7 @@ class _ResultTrajectory(Trajectory):
     def __init__(self, result: Result) -> None:
         if result.header.drops:
             raise InputError(
-                f"{result.path} holds only the particles that are there (output.drop_retired): a trajectory has the "
+                f"{result.path} holds only the particles present (output.drop_retired): a trajectory has the "
                 "same ones in all frames; run the scene without it."
             )
         counts = result.particle_counts
@@ -154,7 +153,7 @@ class _ResultTrajectory(Trajectory):
         if result.kind == "segments":
             told = (result.record or {}).get("frames_written")
             written = told if isinstance(told, int) else 0
-            # A run that goes on may have sealed some after they were listed.
+            # A running simulation may have sealed further frames after they were listed.
             count = result.frame_count if result.frame_count >= written else open_result(result.path).frame_count
             if not np.array_equal(result.numbers, np.arange(len(result.numbers))) or count < written:
                 raise InputError(
@@ -192,11 +191,10 @@ class _ResultTrajectory(Trajectory):
 class Dataset:
     """Trajectories by number, made by `open_dataset`; iteration yields all of them in the order of their numbers.
 
-    No file stays open, so that a Dataset can be copied to the workers of a data loader.
+    No file stays open, so that it can be copied to the workers of a data loader.
 
     Attributes:
-        path: as it was opened.
-        numbers: of the trajectories, ascending.
+        path: path as given. numbers: numbers of the trajectories, ascending.
         splits: the numbers of each split, by "train", "valid" and "test".
     """
 
@@ -214,7 +212,7 @@ class Dataset:
         return (self[number] for number in self.numbers)
 
     def __getitem__(self, number: int) -> Trajectory:
-        """Return a trajectory, whose arrays are read later; InputError: there is none, or its shard is damaged."""
+        """Return a trajectory, whose arrays are read on access; InputError: there is none, or its shard is damaged."""
         if number not in self._known:
             first, last = self.numbers[0], self.numbers[-1]
             held = f"{len(self)}, from {first} to {last}" if len(self) > 1 else f"number {first} only"
@@ -225,7 +223,7 @@ class Dataset:
 
 
 def is_dataset(path: Path) -> bool:
-    """Return whether a directory holds the shards of a dataset."""
+    """Return whether a directory contains the shards of a dataset."""
     return (path / SHARDS).is_dir()
 
 
@@ -238,7 +236,7 @@ def open_dataset(path: Path | str) -> Dataset:
         path: the directory of a dataset, the directory of a result, or its particles.vtkhdf.
 
     Raises:
-        InputError: nothing of the kind is there, it holds no trajectory, or a shard is damaged.
+        InputError: there is no dataset or result, it has no trajectory, or a shard is damaged.
     """
     path = Path(path)
     if not path.exists():

@@ -26,18 +26,18 @@ from mpmcli.scene.toml_file import key_parts, set_value
 
 # Signed distance of points (n, d), (n,), m.
 Distance = Callable[[np.ndarray], np.ndarray]
-# Candidates that are drawn for one body before the placement starts anew, and how often it does.
+# Candidates drawn for one body before the placement restarts, and number of restarts.
 TRIES = 256
 STARTS = 20
-# How often sizes and radii are drawn before a trajectory is given up.
+# Number of times that sizes and radii are drawn before a trajectory is given up.
 ROUNDS = 10
-# Seeds of bodies that are sampled at random are below this, so that every format holds them exactly.
+# Upper bound of random seeds of bodies, so that every format stores them exactly.
 SEEDS = 2**53
 
 
 @dataclass(frozen=True, eq=False)
 class RoundedBox:
-    """All points no farther than `radius`, m, from a box of half edge lengths `half`, (d,), m; so also a ball."""
+    """All points within `radius`, m, of a box of half edge lengths `half`, (d,), m; a ball if `half` is 0."""
 
     center: np.ndarray
     half: np.ndarray
@@ -46,7 +46,7 @@ class RoundedBox:
 
 @dataclass(frozen=True, eq=False)
 class Wanted:
-    """A body that needs a place in its region, from `lower` to `upper`, (d,), m; it fits in.
+    """A body to be placed in its region, from `lower` to `upper`, (d,), m, into which it fits.
 
     `half` and `radius` are those of a RoundedBox; `volume` in m^3 (m^2 in 2D), as large bodies are placed first;
     `min_distance` to other bodies in m.
@@ -62,7 +62,7 @@ class Wanted:
 
 
 class NoPlace(Exception):  # noqa: N818
-    """No arrangement was found; in that which came farthest, `placed` bodies had a place, and body `index` had none."""
+    """No arrangement was found; the best one placed `placed` bodies and failed at body `index`."""
 
     def __init__(self, index: int, placed: int) -> None:
         super().__init__(index, placed)
@@ -70,7 +70,7 @@ class NoPlace(Exception):  # noqa: N818
 
 
 def room_before(centers: np.ndarray, half: np.ndarray, radius: float, wall: Distance) -> np.ndarray:
-    """Return how far a rounded box at each of m centres (m, d) is from a wall, (m,), m: exact for convex room."""
+    """Return the distance of a rounded box at m centres (m, d) from a wall, (m,), m: exact in a convex container."""
     corners = box_corners(-half, half)
     return np.min([wall(centers + corner) for corner in np.unique(corners, axis=0)], axis=0) - radius
 
@@ -90,10 +90,10 @@ def rounded_box(form: Form) -> RoundedBox:
 def find_places(
     wanted: Sequence[Wanted], obstacles: Sequence[RoundedBox], walls: Sequence[Distance] = ()
 ) -> list[np.ndarray]:
-    """Return the centre of every body, (d,), m, by rejection, the largest first; NoPlace after STARTS starts.
+    """Return the centre of every body, (d,), m, by rejection sampling, the largest first; NoPlace after STARTS starts.
 
-    Each takes the first of TRIES candidates, uniform in its region, that keeps its distance from `obstacles`, from
-    bodies before it, and from `walls`, signed distances that are positive where there is room.
+    Each body takes the first of TRIES candidates, uniform in its region, that keeps its distance from `obstacles`, from
+    bodies already placed, and from `walls`, signed distances that are positive in free space.
     """
     order = sorted(range(len(wanted)), key=lambda i: -wanted[i].volume)
     farthest = NoPlace(0, -1)
@@ -124,7 +124,7 @@ def _free_center(
     free = np.ones(TRIES, dtype=bool)
     if others:
         distance = distances(centers, body.half, body.radius, others)
-        # Bodies that overlap have the distance 0, too.
+        # Overlapping bodies have the distance 0, too.
         free = np.all((distance >= apart) & (distance > 0), axis=1)
     for wall in walls:
         room = room_before(centers, body.half, body.radius, wall)
@@ -142,7 +142,7 @@ def distances(centers: np.ndarray, half: np.ndarray, radius: float, others: Sequ
 
 
 class PlacementError(InputError):
-    """The bodies of a placement have no place; `source` is the sweep file, `placement` the index of the placement."""
+    """The bodies of a placement cannot be placed; `source` is the sweep file, `placement` the index in it."""
 
     def __init__(self, source: str, placement: int, sentence: str) -> None:
         super().__init__(source, placement, sentence)
@@ -153,9 +153,9 @@ class PlacementError(InputError):
 
 
 def place_bodies(values: TrajectoryValues, data: dict[str, Any]) -> list[list[dict[str, Any]]]:
-    """Return for each placement its bodies: name, corners or centre and radius, and velocity where it is drawn.
+    """Return for each placement its bodies: name, corners or centre and radius, and velocity if it is drawn.
 
-    Where bodies find no places, all sizes are drawn anew, up to ROUNDS times, and then PlacementError is raised. `data`
+    If placement fails, all sizes are drawn again, up to ROUNDS times; then PlacementError is raised. `data`
     is the parsed TOML of the scene with its templates.
     """
     placements = values.sweep.placements
@@ -177,7 +177,7 @@ def place_bodies(values: TrajectoryValues, data: dict[str, Any]) -> list[list[di
             shape = templates[place.key]["shape"]
             name = "radius" if "ball" in shape else "size"
             distribution = getattr(place, name)
-            # What is drawn, else that of the template.
+            # The drawn value, else that of the template.
             extent = template_extent(shape)
             if distribution is not None:
                 stream = f"{place.key}.{k}.{name}" + (f".{round_number}" if round_number else "")
@@ -235,7 +235,7 @@ def template_extent(shape: dict[str, Any]) -> Any:
 def _obstacles(
     data: dict[str, Any], templates: set[tuple[str, str]], directory: Path
 ) -> tuple[list[RoundedBox], list[Distance]]:
-    """Return bodies and colliders that stay, and distances of walls; the scene's validation tells of faulty ones."""
+    """Return bodies and colliders that stay, and distances of walls; validation of the scene reports faulty ones."""
     dimension = dimension_of(data)
     constants, _ = definitions(data.get("constants"), dimension)
     context = {"dimension": dimension, "constants": constants, "directory": directory}
@@ -265,9 +265,9 @@ def _obstacles(
 class Draw:
     """One trajectory of a sweep, of the `split` "train", "valid" or "test".
 
-    `values` were drawn, as JSON holds them: of each key of [vary], and under `place.NAME` (`place.colliders.NAME`)
-    lists of placed `{name, min, max}` or `{name, center, radius}`, with `velocity` where drawn. `data` is the parsed
-    TOML with all of it; origins are indices of base entries; `source` names the scene in errors.
+    `values` are the drawn values as JSON: of each key of [vary], and under `place.NAME` (`place.colliders.NAME`) lists
+    of placed `{name, min, max}` or `{name, center, radius}`, with `velocity` if drawn. `data` is the parsed TOML with
+    these values; origins are indices of base entries; `source` names the scene in errors.
     """
 
     number: int
@@ -289,11 +289,11 @@ class Draw:
 
 
 def draw(sweep: Sweep, number: int, given: Mapping[str, Any] = MappingProxyType({})) -> Draw:
-    """Draw one trajectory, always the same; PlacementError: bodies have no place; ValueError: there is no such one.
+    """Draw one trajectory, deterministically; PlacementError: bodies cannot be placed; ValueError: no such number.
 
-    Random values depend on the seed, the number and their own key alone; Sobol and Latin ones also on which keys are
-    continuous, Latin ones on the count. Bodies and emitters sampled at random get seeds of their own unless [vary] has
-    them. A force on a replaced body acts on each in its place. `given` values replace drawn ones.
+    Random values depend on the seed, the number and their own key alone; Sobol and Latin values also on the set of
+    continuous keys, Latin values on the count. Bodies and emitters with random sampling get their own seeds unless
+    [vary] has them. A force on a template acts on each body that replaces it. `given` values replace drawn ones.
     """
     if not 0 <= number < sweep.count:
         raise ValueError(f"The sweep has trajectories 0 to {sweep.count - 1}; there is no trajectory {number}.")
@@ -322,7 +322,7 @@ def draw(sweep: Sweep, number: int, given: Mapping[str, Any] = MappingProxyType(
 
 
 def _put_in_place(data: dict[str, Any], name: str, placed: dict[str, list[dict[str, Any]]]) -> tuple[int, ...]:
-    """Replace every template of a list by what is placed, and return the index of the base entry of each entry."""
+    """Replace every template of a list by its placed entries, and return the index of the base entry of each entry."""
     entries, origins = [], []
     for index, entry in enumerate(data.get(name, [])):
         for new in placed.get(entry["name"], [None]):

@@ -1,4 +1,4 @@
-"""Export of a dataset for training code, NumPy and ParaView: a directory that appears complete, or not at all."""
+"""Exports a dataset for training code, NumPy and ParaView, to a directory that appears complete or not at all."""
 
 import itertools
 import json
@@ -32,10 +32,10 @@ _OURS = re.compile(r"metadata\.json|checksums\.sha256|(train|valid|test)\.(h5|np
 
 @dataclass(frozen=True)
 class ExportSettings:
-    """What is exported, and where to.
+    """Settings of an export: format, selection and target.
 
-    `form` is a key of FORMATS; an earlier export is replaced with `overwrite` alone; None exports every trajectory, or
-    all particles. `wall_spacing` is between particles on walls, m, None for that of the others.
+    `form` is a key of FORMATS; an earlier export is replaced only with `overwrite`; None exports every trajectory, or
+    all particles. `wall_spacing` is the distance of particles on walls, m, None for that of the others.
     """
 
     form: str
@@ -50,7 +50,7 @@ class ExportSettings:
 
 @dataclass(frozen=True)
 class ExportSummary:
-    """What was written: trajectories by split, most frames and particles of one, bytes of all files, and notes."""
+    """Summary of an export: trajectories by split, largest numbers of frames and particles, total bytes, and notes."""
 
     directory: str
     form: str
@@ -78,10 +78,11 @@ class ExportSummary:
 def export(
     dataset: Dataset, settings: ExportSettings, watch: Callable[[int], None] = lambda done: None
 ) -> ExportSummary:
-    """Write a directory with a dataset in another format, and metadata.json; all of it, or nothing.
+    """Write a directory with a dataset in another format and metadata.json, completely or not at all.
 
-    `watch` is told the trajectories written. InputError, nothing written: the directory is in use, there is no such
-    trajectory, or the format cannot hold it. RunError, nothing left: the disk is full or refuses.
+    `watch` is called with the number of trajectories written. InputError, nothing written: the directory is in use,
+    there is no such trajectory, or the format cannot store it. RunError, nothing left: the disk is full or a write
+    failed.
     """
     directory = Path(settings.directory)
     check_export_directory(directory, settings.overwrite)
@@ -99,7 +100,7 @@ def export(
         if gone:
             raise InputError(
                 f"{dataset.path} lacks {counted(len(gone), 'trajectory')} of its manifest, {min(gone):06d} among them: "
-                "what made it was ended, or a file is gone; --trajectory N exports one that is there."
+                "its sweep was interrupted, or a file is missing; --trajectory N exports one that is there."
             )
         lack, told = status.lack(), status.as_dict()
         metadata["dataset"] = {name: told[name] for name in ("part", "trajectories", "done", "accepted", "verdicts")}
@@ -138,7 +139,7 @@ def export(
 
 
 def check_export_directory(directory: Path, overwrite: bool) -> None:
-    """Refuse a directory that holds anything, or, with `overwrite`, anything but an earlier export."""
+    """Refuse a directory that is not empty, or, with `overwrite`, contains anything but an earlier export."""
     check_directory(directory, overwrite)
     if directory.resolve() == Path.cwd():
         raise InputError(f"{directory} is the present directory, which an export would replace: give another with -o.")
@@ -153,7 +154,7 @@ def check_export_directory(directory: Path, overwrite: bool) -> None:
 
 @contextmanager
 def new_directory(directory: Path, overwrite: bool) -> Iterator[Path]:
-    """Give an empty directory to write to; on leaving, put it at `directory`; if the block raises, leave nothing."""
+    """Yield an empty directory to write to; on exit, move it to `directory`; if the block raises, remove it."""
     check_export_directory(directory, overwrite)
     target = directory.resolve()
     missing = [parent for parent in target.parents if not parent.exists()]
@@ -170,7 +171,7 @@ def new_directory(directory: Path, overwrite: bool) -> Iterator[Path]:
         for path in temporary.iterdir():
             sync_file(path)
         if target.exists():
-            # Something may have been put into it meanwhile.
+            # Files may have appeared in it meanwhile.
             check_export_directory(directory, overwrite)
             os.rename(target, former)
         try:
@@ -190,7 +191,7 @@ def new_directory(directory: Path, overwrite: bool) -> Iterator[Path]:
 
 
 def is_export(path: Path) -> bool:
-    """Return whether a directory holds an export, whole or not."""
+    """Return whether a directory contains an export, complete or not."""
     return path.is_dir() and (EXPORTED_BY in _metadata(path) or ((path / SUMS).exists() and (path / METADATA).exists()))
 
 

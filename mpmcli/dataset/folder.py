@@ -1,6 +1,6 @@
-"""The directory of a dataset: its manifest, a SQLite file with a row for each trajectory, its shards, and copies.
+"""The directory of a dataset: its manifest, a SQLite file with a row per trajectory, its shards, and copied files.
 
-Copies are those of files that the scenes of a sweep read, beside their TOML files: geometry and plugins.
+Copied files are those that the scenes of a sweep read besides their TOML files, such as geometry.
 """
 
 import json
@@ -32,23 +32,22 @@ from mpmcli.scene.toml_file import key_parts
 
 MANIFEST = "manifest.sqlite"
 FORMAT = 1
-# Bytes of a shard, about: large enough for a file system and for copies over a network, small enough to lose.
+# Approximate bytes of a shard: large enough for file systems and network copies, small enough to recompute.
 SHARD_BYTES = 256e6
 VERDICTS: tuple[Verdict, ...] = get_args(Verdict)
 
 
 @dataclass(frozen=True)
 class Row:
-    """What is known of a trajectory.
+    """The record of a trajectory in the manifest.
 
     Attributes:
-        draws: what was drawn, JSON; scene: SHA-256 of the complete scene.
-        verdict: one of VERDICTS; reason: why it is not "stable", "" where it is.
-        accepted: 1 where the dataset includes it.
-        retries: runs with half the step of the one before; steps, frames, particles: counts of the last run.
+        draws: drawn values, JSON; scene: SHA-256 of the complete scene. verdict: one of VERDICTS; reason: why it is not
+            "stable", "" if it is. accepted: 1 if the dataset includes it. retries: number of runs with a halved step;
+            steps, frames, particles: counts of the last run.
         seconds: wall time of all runs.
         arch, precision, version, taichi: backend, and versions of mpmcli and Taichi.
-        file: where the frames are, relative to the dataset, "" where none were kept; checksum: `shard.checksum`.
+        file: file of the frames, relative to the dataset, "" if none were kept; checksum: `shard.checksum`.
     """
 
     number: int
@@ -72,14 +71,14 @@ class Row:
 
     @classmethod
     def failed(cls, number: int, split: str, reason: str = "") -> "Row":
-        """Return the row of a trajectory of which nothing is known but that it failed."""
+        """Return the row of a failed trajectory without further facts."""
         values: dict[str, Any] = {f.name: f.type() for f in fields(cls)}
         values |= {"number": number, "split": split, "draws": "{}", "verdict": "failed", "reason": reason}
         return cls(**{**values, "version": __version__, "taichi": version("taichi")})
 
 
 class _SweepFacts(BaseModel):
-    """What is read of the facts of a sweep; others are taken as they are."""
+    """The validated facts of a sweep; other facts are kept as they are."""
 
     model_config = ConfigDict(extra="allow")
 
@@ -101,9 +100,9 @@ class Manifest:
         self.path = directory / MANIFEST
 
     def create(self, facts: Mapping[str, Any]) -> None:
-        """Make the file, with facts that JSON can hold."""
+        """Make the file, with facts as JSON."""
         columns = ", ".join(f"{f.name} {_TYPES[f.type]} NOT NULL" for f in fields(Row))
-        # Under its name there is never half a manifest.
+        # A file with its name is never incomplete.
         with sealed(self.path) as temporary, self._open("create", temporary) as connection:
             connection.execute("CREATE TABLE sweep (name TEXT PRIMARY KEY, value TEXT NOT NULL)")
             connection.execute(f"CREATE TABLE trajectories ({columns}, PRIMARY KEY (number))")
@@ -126,7 +125,7 @@ class Manifest:
             return _ROWS.validate_python([dict(row) for row in rows])
 
     def put(self, rows: Iterable[Row]) -> None:
-        """Add rows, or replace those of the same numbers, all at once and durably."""
+        """Add rows, or replace those with the same numbers, atomically and durably."""
         insert = f"INSERT OR REPLACE INTO trajectories ({_COLUMNS}) VALUES ({', '.join('?' * len(fields(Row)))})"
         with self._open("write", self.path) as connection:
             connection.executemany(insert, map(astuple, rows))
@@ -144,9 +143,9 @@ class Manifest:
     @contextmanager
     def _reading(self) -> Iterator[sqlite3.Connection]:
         if not self.path.is_file():
-            raise InputError(f"{self.path.parent} is no dataset: it has no {MANIFEST}.")
+            raise InputError(f"{self.path.parent} is not a dataset: it has no {MANIFEST}.")
         try:
-            # Not mode=ro, which could not roll back what a killed writer left.
+            # Not mode=ro, which cannot roll back the changes of a killed writer.
             with closing(sqlite3.connect(f"file:{self.path}?mode=rw", uri=True)) as connection:
                 yield connection
         except (sqlite3.Error, ValueError) as error:
@@ -155,7 +154,7 @@ class Manifest:
 
 
 def require_empty(directory: Path, *, locked: bool = False) -> None:
-    """Refuse a directory that holds something, is being written or cannot be; `locked` says that this process does."""
+    """Refuse a directory that is not empty, is being written or cannot be written; `locked`: by this process."""
     if directory.is_dir() and any(path.name != LOCK for path in directory.iterdir()):
         raise InputError(f"{directory} exists and is not empty: give another directory with -o.")
     check_directory(directory, overwrite=False, locked=locked)
@@ -164,7 +163,7 @@ def require_empty(directory: Path, *, locked: bool = False) -> None:
 class Folder:
     """Places of the trajectories in a dataset.
 
-    Each of its shards has `per_shard` of `count` trajectories, the last one fewer. With `part` (i, n) this directory
+    Each shard has `per_shard` of `count` trajectories; the last one may have fewer. With `part` (i, n) this directory
     has every n-th shard, from the i-th on, counted from 1.
     """
 
@@ -195,9 +194,9 @@ class Folder:
         return f"{SHARDS}/{shard:05d}.h5"
 
     def is_kept(self, row: Row) -> bool:
-        """Return whether a row is final: its frames are where it says. A failed one is tried again.
+        """Return whether a row is final: its frames are in its file.
 
-        So is one whose own file is damaged, of which no shard could be made.
+        A failed trajectory is tried again, and so is one whose single file is damaged and cannot enter a shard.
         """
         path = self.path / row.file
         if row.verdict == "failed" or not row.file:
@@ -205,13 +204,13 @@ class Folder:
         return path.is_file() and (row.file.startswith(f"{SHARDS}/") or checksum_is_right(path))
 
     def seal(self, shard: int, rows: Mapping[int, Row]) -> list[Row]:
-        """Join accepted trajectories of a shard durably, return changed rows; RunError: the single files are kept."""
+        """Join accepted trajectories to a shard durably, return changed rows; RunError: the single files are kept."""
         accepted = [rows[n] for n in self.numbers(shard) if rows[n].accepted]
         target = self.path / self.shard_file(shard)
         if not accepted:
             return []
         files = {row.number: self.path / row.file for row in accepted}
-        # Those that were sealed before are in the shard that is replaced.
+        # Trajectories sealed earlier are in the shard that is replaced.
         size = sum(file.stat().st_size for file in set(files.values()))
         kept = f"its trajectories are kept in {self.path / PENDING}"
         target.parent.mkdir(exist_ok=True)
@@ -230,12 +229,12 @@ class Folder:
 
 
 FILE, PLUGIN = "file", "--plugin"
-# Names in a dataset that no copy takes.
+# Names in a dataset that copied files cannot have.
 OWN = {SWEEP, BASE, SHARDS, PENDING, QUARANTINE}
 
 
 def source_files(sweep: Sweep, plugins: Sequence[Path]) -> dict[str, Path]:
-    """Return the absolute paths of the files that are there, by their names in the scenes, and `--plugin NAME`."""
+    """Return the absolute paths of existing files, by their names in the scenes, and `--plugin NAME`."""
     names = set(_named(sweep.base_data))
     for key, distribution in sweep.distributions.items():
         for value in getattr(distribution, "values", ()):
@@ -254,16 +253,16 @@ def source_digests(sweep: Sweep, plugins: Sequence[Path]) -> dict[str, str]:
 
 
 def copied_files(names: Iterable[str]) -> list[str]:
-    """Return those names of `source_files` of which a dataset has copies, at the same places beside its base.
+    """Return the names of `source_files` that a dataset copies, to the same places relative to its base.
 
-    Files whose names are absolute, or lead out of the directory of the base, stay where they are, as plugins do.
+    Files with absolute names, files outside the directory of the base, and plugins are not copied.
     """
     found = [name for name in names if not name.startswith(PLUGIN)]
     return [name for name in found if not Path(name).is_absolute() and not {"..", *OWN} & {*Path(name).parts}]
 
 
 def copy_sources(names: Iterable[str], origin: Path, directory: Path) -> None:
-    """Copy files into a dataset from where the base scene is, or from another dataset; those that are there."""
+    """Copy existing files to a dataset, from the directory of the base scene or from another dataset."""
     for name in copied_files(names):
         if (origin / name).is_file():
             (directory / name).parent.mkdir(parents=True, exist_ok=True)
@@ -271,7 +270,7 @@ def copy_sources(names: Iterable[str], origin: Path, directory: Path) -> None:
 
 
 def standing_alone(sweep: Sweep) -> str:
-    """Return the text of a sweep with BASE as its base, and its count; one that is written oddly as it is."""
+    """Return the text of a sweep with BASE as its base, and its count; text of unusual layout is not changed."""
     head, tables = re.match(r"(?ms)(.*?)(^[ \t]*\[.*|\Z)", sweep.text).groups()
     for key, value in (("base", f'"{BASE}"'), ("count", str(sweep.count))):
         line = f"{key} = {value}"
@@ -285,7 +284,7 @@ def standing_alone(sweep: Sweep) -> str:
 
 
 def _named(value: Any) -> Iterator[str]:
-    """Yield the names of files in tables."""
+    """Yield the names of files in nested tables."""
     if isinstance(value, dict):
         for key, entry in value.items():
             if key == FILE and isinstance(entry, str):

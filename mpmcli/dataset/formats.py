@@ -27,18 +27,18 @@ from mpmcli.output.durable import ask_for
 from mpmcli.output.layout import POSITION
 from mpmcli.output.vtkhdf import VtkhdfWriter, file_size
 
-# What a format says in metadata.json, and notes for the user.
+# Entries of a format in metadata.json, and notes for the user.
 Written = tuple[dict[str, Any], list[str]]
 
 
 class Format(ABC):
-    """Trajectories of the same dimension as files of a format."""
+    """Writes trajectories of one dimension as files of a format."""
 
     def __init__(self, trajectories: Sequence[SubsampledTrajectory]) -> None:
         self.trajectories = trajectories
 
     def check(self) -> None:  # noqa: B027
-        """Refuse with an InputError what the format cannot hold."""
+        """Raise an InputError for trajectories that the format cannot store."""
 
     @abstractmethod
     def size(self) -> int:
@@ -50,7 +50,7 @@ class Format(ABC):
 
 
 class TrainingFormat(Format):
-    """A file for each split; laws have particle types from `usual`, then `free`; `KINDS` are the types of walls."""
+    """One file per split; laws get particle types from `usual`, then `free`; `KINDS` are the types of walls."""
 
     name: ClassVar[str]
     suffix: ClassVar[str]
@@ -63,7 +63,7 @@ class TrainingFormat(Format):
 
     @abstractmethod
     def facts(self) -> Written:
-        """Return what no other format says."""
+        """Return the entries of this format alone."""
 
     @abstractmethod
     def write_split(self, path: Path, chosen: Sequence[SubsampledTrajectory], tick: Callable[[], None]) -> None:
@@ -90,7 +90,7 @@ class TrainingFormat(Format):
                 self.write_split(directory / file, chosen, tick)
             else:
                 notes.append(f"No trajectory is of the split {split}: {file} is left out, as loaders need one.")
-        # Metadata has one entry for all domains.
+        # The metadata has one entry for all domains.
         if self._domains_differ:
             notes.append("The domains of the trajectories differ: bounds is the box around all of them.")
         return facts | {"particle_types": self.types | self._wall_types(), **statistics}, notes
@@ -102,7 +102,7 @@ class TrainingFormat(Format):
 
     @cached_property
     def types(self) -> dict[str, int]:
-        """The particle type of each law; an InputError says that there are more laws than types."""
+        """The particle type of each law; InputError: there are more laws than types."""
         laws = sorted({law.name for each in self.trajectories for law in each.source.header.laws})
         taken = self._wall_types().values()
         types = {name: self.usual[name] for name in laws if self.usual.get(name, -1) not in {-1, *taken}}
@@ -165,11 +165,11 @@ class LagrangeBench(TrainingFormat):
         lower, upper = domain_around([each.source.header for each in self.trajectories])
         for each in self.trajectories:
             if each.walls.count:
-                # A collider may reach, or move, out of the domain.
+                # A collider may extend or move out of the domain.
                 points = each.walls.positions(each.times)
                 lower, upper = np.minimum(lower, points.min(axis=(0, 1))), np.maximum(upper, points.max(axis=(0, 1)))
         periodic = self.trajectories[0].source.header.periodic
-        # Two radii: neighbour lists may be searched for at more than one.
+        # Two radii: neighbour lists may use a search radius larger than one.
         gap = 2 * RADIUS_IN_SPACINGS * max(each.spacing for each in self.trajectories)
         return lower, upper - lower, upper - lower + np.where(periodic.any() & ~periodic, gap, 0.0)
 
@@ -180,7 +180,7 @@ class LagrangeBench(TrainingFormat):
         notes = []
         if (box > extent).any():
             notes.append("LagrangeBench repeats all axes or none: bounds reach beyond the walls of the others.")
-        # As there, the frame that only serves as the last target does not count.
+        # As in LagrangeBench, the frame that is only the last target does not count.
         length = first.frame_count - 1
         lengths = {"sequence_length_train": length, "sequence_length_test": length}
         return {"solver": "MPM", "case": first.source.header.title, **lengths, **place}, notes
@@ -193,16 +193,17 @@ class LagrangeBench(TrainingFormat):
                 tick()
 
     def _write_trajectory(self, group: h5py.Group, trajectory: SubsampledTrajectory) -> None:
-        # The layout of the file depends on when its objects are closed: here, before the next group is made.
+        # The layout of the file depends on the time at which objects are closed: before the next group is made.
         shape = (trajectory.frame_count, trajectory.whole_count, trajectory.layout.dimension)
-        # Loaders read windows of some frames: a chunk is one.
+        # Loaders read windows of several frames: a chunk is one window.
         position = group.create_dataset("position", shape, np.float32, chunks=(1, *shape[1:]), compression="gzip")
         first, (lower, extent, _) = 0, self._box
         periodic = self.trajectories[0].source.header.periodic
         for block in trajectory.whole_blocks():
             placed = block.astype(np.float64) - lower
             placed = np.where(periodic, np.mod(placed, extent), placed)
-            # A place on an upper face lies below it, by a few roundings of the quotient by which a cell is found.
+            # A position on an upper face is moved below it by a few rounding errors of the quotient that determines its
+            # cell.
             position[first : first + len(block)] = np.clip(placed, 0.0, extent * (1 - 2.0**-20)).astype(np.float32)
             first += len(block)
         group.create_dataset("particle_type", data=self.particle_types(trajectory))
@@ -212,13 +213,13 @@ class Gns(TrainingFormat):
     """train.npz, valid.npz and test.npz, as the particle data loader of GNS reads them.
 
     Source: github.com/geoelements/gns, gns/data_loader.py, gns/train.py and docs/gns_data.md. Each entry is an object
-    array of (positions (T, N, d) float32, particle type (N,) int64), and, where parameters differ within a law, so
-    that the type does not tell them, (N,) or (N, m) float64 with those.
+        array of (positions (T, N, d) float32, particle type (N,) int64), and, if parameters differ within a law, (N,)
+        or (N, m) float64 with the parameters.
     """
 
     name, suffix = "GNS", ".npz"
-    # As in the data of DeepMind's "Learning to simulate": 5 water, 6 sand, 7 goop; 3 stands for particles whose motion
-    # is given, here those on walls, and 0 for rigid bodies.
+    # As in the data of DeepMind's "Learning to simulate": 5 water, 6 sand, 7 goop; 3 is for particles with prescribed
+    # motion, here those on walls, and 0 for rigid bodies.
     usual: ClassVar = dict(fluid=5, sand=6, viscoplastic=7, fixed_corotated=0, neo_hookean=1, snow=2, von_mises=4)
     free = (8, 4, 2, 1, 0, 7)
     wall = moving_wall = 3
@@ -228,14 +229,14 @@ class Gns(TrainingFormat):
         for each in self.trajectories:
             if each.source.header.periodic.any():
                 raise InputError(
-                    f"trajectory {each.source.number} has periodic faces, which GNS does not know: velocities would "
+                    f"trajectory {each.source.number} has periodic faces, which GNS does not support: velocities would "
                     "jump there, and particles at them lack neighbours; --to lagrangebench and --to npz take them."
                 )
         super().check()
 
     @cached_property
     def parameters(self) -> list[str]:
-        """Names of numeric parameters of materials whose values differ between bodies of a law, in any trajectories."""
+        """Names of numeric material parameters that differ between bodies of one law, over all trajectories."""
         values: dict[tuple[str, str], set[float]] = {}
         for each in self.trajectories:
             for body in each.source.header.bodies:
@@ -252,9 +253,10 @@ class Gns(TrainingFormat):
         ]
         values = np.concatenate([self._parameters_of_bodies(each) for each in self.trajectories])
         return {
-            # Every frame counts: a rollout is compared with all that follow the first six.
+            # Every frame counts: a rollout is compared with all frames after the first six.
             "sequence_length": self.trajectories[0].frame_count,
-            # Of a particle: the last 5 velocities, the distances to 2 d walls, and 16 numbers that stand for its type.
+            # Per particle: the last 5 velocities, the distances to 2 d walls, and an embedding of its type in 16
+            # numbers.
             "nnode_in": 5 * d + 2 * d + 16 + len(names),
             "nedge_in": d + 1,
             "material_feature_len": len(names),
@@ -264,7 +266,7 @@ class Gns(TrainingFormat):
         }, notes if len(names) > 1 else []
 
     def _parameters_of_bodies(self, trajectory: SubsampledTrajectory) -> np.ndarray:
-        """Return the parameters of each body, (bodies, m), in the units of scenes; 0 where a law has no such one."""
+        """Return the parameters of each body, (bodies, m), in the units of scenes; 0 if a law has no such parameter."""
         bodies = trajectory.source.header.bodies
         rows = [[body.material.get(name, 0.0) for name in self.parameters] for body in bodies]
         numbers = [[float(value) if isinstance(value, int | float) else 0.0 for value in row] for row in rows]
@@ -277,11 +279,11 @@ class Gns(TrainingFormat):
                 positions = np.concatenate([block.astype(np.float32) for block in each.whole_blocks()])
                 parts = [positions, self.particle_types(each)]
                 if m:
-                    # The loader broadcasts a single one to (N,), which it could not do with (N, 1).
+                    # The loader broadcasts a single parameter to (N,), which fails with (N, 1).
                     properties = self._parameters_of_bodies(each)[each.label("body")]
                     properties = np.concatenate([properties, np.zeros((each.walls.count, m))])
                     parts.append(properties[:, 0] if m == 1 else properties)
-                # From a tuple of arrays numpy would try to make one array of numbers, and fail.
+                # numpy would try to convert a tuple of arrays to one numeric array, and fail.
                 entry = np.empty(len(parts), object)
                 for k, part in enumerate(parts):
                     entry[k] = part
@@ -292,7 +294,7 @@ class Gns(TrainingFormat):
 
 
 class Npz(Format):
-    """One .npz for each trajectory, which numpy reads without pickles; they may differ in all but d."""
+    """One .npz per trajectory, which numpy reads without pickles; all must have the same d."""
 
     def size(self) -> int:
         particles = sum(e.particle_count * e.layout.bytes_per_particle * e.frame_count for e in self.trajectories)
@@ -339,7 +341,7 @@ class Npz(Format):
 
 
 class Vtkhdf(Format):
-    """One temporal VTKHDF file for each trajectory, as `mpmcli simulate` packs it."""
+    """One temporal VTKHDF file per trajectory, as packed by `mpmcli simulate`."""
 
     def check(self) -> None:
         if any(each.walls.walls != "none" for each in self.trajectories):
@@ -352,7 +354,7 @@ class Vtkhdf(Format):
         for each in self.trajectories:
             path = directory / f"{group_name(each.source.number)}.vtkhdf"
             n, frames, layout = each.particle_count, each.frame_count, each.layout
-            # The same for all frames.
+            # Constant over all frames.
             fixed = {name: each.label(name) for name in LABELS} | {"id": np.arange(n, dtype=layout.arrays["id"].dtype)}
             ask_for(path, file_size(layout, [n] * frames))
             with VtkhdfWriter(path, layout, [n] * frames) as writer:
@@ -374,13 +376,13 @@ class Vtkhdf(Format):
 
 
 def write_npz(path: Path, arrays: Iterable[tuple[str, np.ndarray]]) -> None:
-    """Write an .npz as numpy does, but with one array in memory at a time, and no time of writing.
+    """Write an .npz as numpy does, but with one array in memory at a time and without a timestamp.
 
-    Compression would take two thirds of the time of an export, and save a seventh of its bytes.
+    Compression would take two thirds of the time of an export and save a seventh of its bytes.
     """
     with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:
         for name, array in arrays:
-            # Entries that are opened by name have the date 1980-01-01.
+            # Entries opened by name have the date 1980-01-01.
             with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
                 np.lib.format.write_array(entry, array, allow_pickle=array.dtype == object)
 

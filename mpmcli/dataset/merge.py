@@ -13,7 +13,7 @@ from mpmcli.output.lock import take_lock
 
 
 def merge(parts: Sequence[Path], target: Path) -> Status:
-    """Copy complete parts of one sweep into a dataset as of one part; InputError, nothing written: a part is wrong."""
+    """Merge complete parts of one sweep into one dataset; InputError, nothing written: a part is unsuitable."""
     require_empty(target)
     facts = [Manifest(part).facts() for part in parts]
     for part, its in zip(parts, facts, strict=True):
@@ -21,7 +21,7 @@ def merge(parts: Sequence[Path], target: Path) -> Status:
             raise InputError(f"{part} has another sweep, other files or another version of mpmcli than {parts[0]}.")
     count = facts[0]["part"][1]
     there = sorted(its["part"][0] for its in facts)
-    # A part beyond the last shard is empty, and nobody can compute it.
+    # A part beyond the last shard is empty and cannot be computed.
     shards = -(-facts[0]["count"] // facts[0]["per_shard"])
     needed = list(range(1, min(count, shards) + 1))
     if there != needed:
@@ -37,7 +37,7 @@ def merge(parts: Sequence[Path], target: Path) -> Status:
         require_empty(target, locked=True)
         size = sum(file.stat().st_size for file in files)
         require_free_space(target, size, "the merged dataset", "the parts are kept", several=True)
-        # First, so that what a kill leaves lacks what its manifest names.
+        # The manifest comes first, so that a killed merge is recognised by the files that it lacks.
         manifest = Manifest(target)
         manifest.create({**facts[0], "part": [1, 1]})
         manifest.put(row for part in parts for row in Manifest(part).rows())

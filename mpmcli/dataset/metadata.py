@@ -17,16 +17,16 @@ from mpmcli.output.header import RunHeader
 RADIUS_IN_SPACINGS = 1.5
 EXPORTED_BY = "exported_by"
 FORMAT_KEY, FORMAT = "export_format", 2
-# Of the time between frames: they are landed on exactly, up to the rounding of sums.
+# Tolerance as a fraction of the time between frames: steps end at frames exactly, up to the rounding of sums.
 UNEVEN = 1e-6
 LEAST_FRAMES = 3
-# Standard deviations below it become 1, as in LagrangeBench (data_gen/lagrangebench_data/gen_dataset.py): a
-# direction in which nothing moves is not to be divided by.
+# Standard deviations below it become 1, as in LagrangeBench (data_gen/lagrangebench_data/gen_dataset.py): it avoids a
+# division by zero along a direction without motion.
 STD_LEAST = 1e-7
 
 
 def common_facts(trajectories: Sequence[SubsampledTrajectory], stride: int) -> dict[str, Any]:
-    """Return what every format says, lengths in m and times in s; an InputError says that dimensions differ."""
+    """Return the entries of every format, lengths in m and times in s; InputError: the dimensions differ."""
     headers = [each.source.header for each in trajectories]
     first = headers[0]
     for each, header in zip(trajectories, headers, strict=True):
@@ -38,7 +38,7 @@ def common_facts(trajectories: Sequence[SubsampledTrajectory], stride: int) -> d
     spacings = [each.spacing for each in trajectories]
     dx = None if None in spacings else max(spacings)
     cells = [header.spacing for header in headers]
-    # Which trajectory of the dataset is which one of the export.
+    # Numbers in the dataset of the exported trajectories.
     numbers = {split: [e.source.number for e in trajectories if e.source.split == split] for split in SPLITS}
     lengths = {each.frame_count for each in trajectories}
     pauses = [time_between(each) for each in trajectories]
@@ -48,7 +48,7 @@ def common_facts(trajectories: Sequence[SubsampledTrajectory], stride: int) -> d
         FORMAT_KEY: FORMAT,
         "title": first.title,
         "dim": first.dimension,
-        # Three entries in 2D too, as LagrangeBench has it.
+        # Three entries in 2D too, as in LagrangeBench.
         "periodic_boundary_conditions": [*map(bool, first.periodic), False][:3],
         "bounds": np.transpose(bounds).tolist() if placed else None,
         "dt": pauses[0] if same else None,
@@ -67,14 +67,14 @@ def common_facts(trajectories: Sequence[SubsampledTrajectory], stride: int) -> d
 
 
 def domain_around(headers: Sequence[RunHeader]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lower and the upper corner of the box around the domains of runs, (d,), m; all of them are known."""
+    """Return the lower and the upper corner of the box around the domains of runs, (d,), m; all must be known."""
     return np.min([h.origin for h in headers], axis=0), np.max([h.upper for h in headers], axis=0)
 
 
 def outruns_periods(trajectory: SubsampledTrajectory) -> bool:
-    """Return whether a particle goes half of the way of a periodic axis, or more, from one exported frame to the next.
+    """Return whether a particle moves by half of a period or more from one exported frame to the next.
 
-    Positions alone do not tell then which way it went. All frames are read: displacements of those left out add up.
+    Then its direction is ambiguous from positions alone. All frames are read, and displacements between them add up.
     """
     header, stride = trajectory.source.header, trajectory.stride
     if not header.periodic.any():
@@ -99,12 +99,12 @@ def outruns_periods(trajectory: SubsampledTrajectory) -> bool:
 
 
 def learning_facts(trajectories: Sequence[SubsampledTrajectory]) -> tuple[dict[str, list[float]], list[str]]:
-    """Return the statistics of motion of the training split, or of all where it is empty, and a note if so."""
+    """Return the statistics of motion of the training split, or, with a note, of all trajectories if it is empty."""
     train = [each for each in trajectories if each.source.split == "train"]
     notes = [] if train else ["No trajectory is of the training split: the statistics are those of all trajectories."]
     chosen = train or trajectories
     headers = [each.source.header for each in chosen]
-    # After what way, m, the domain repeats along each axis, infinite where it does not.
+    # Period of the domain along each axis, m; infinite if it is not periodic.
     periods = [np.where(header.periodic, header.upper - header.origin, np.inf) for header in headers]
     known = periods if np.isfinite(periods).any() else None
     statistics = motion_statistics((each.blocks("position") for each in chosen), known)
@@ -112,7 +112,7 @@ def learning_facts(trajectories: Sequence[SubsampledTrajectory]) -> tuple[dict[s
 
 
 def require_alike(trajectories: Sequence[SubsampledTrajectory], form: str) -> None:
-    """Refuse with an InputError trajectories that training code cannot, or should not, load as one set."""
+    """Raise an InputError for trajectories that training code cannot or should not load as one set."""
     first, remedy = trajectories[0], "--to npz takes trajectories that differ."
     dt = time_between(first)
     if first.frame_count < LEAST_FRAMES:
@@ -138,18 +138,18 @@ def require_alike(trajectories: Sequence[SubsampledTrajectory], form: str) -> No
                 f"{first.source.number} are at first: {form} has one time between frames; {remedy}"
             )
         if header.origin is None or each.spacing is None:
-            raise InputError(f"trajectory {number} does not say its domain and bodies, which {form} needs; {remedy}")
+            raise InputError(f"trajectory {number} lacks domain and bodies in its header, which {form} needs; {remedy}")
 
 
 def time_between(trajectory: SubsampledTrajectory) -> float | None:
-    """Return the mean time between frames, s; None of a single frame."""
+    """Return the mean time between frames, s; None for a single frame."""
     times = trajectory.times
     return float((times[-1] - times[0]) / (len(times) - 1)) if len(times) > 1 else None
 
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """Count, mean and squared deviations of vectors, (d,), which merge without loss (Chan, Golub and LeVeque 1979)."""
+    """Count, mean and squared deviations of vectors, (d,), mergeable without loss (Chan, Golub and LeVeque 1979)."""
 
     count: int
     mean: np.ndarray
@@ -157,7 +157,7 @@ class Moments:
 
     @classmethod
     def of(cls, vectors: np.ndarray) -> "Moments":
-        """Return the moments of (..., d) vectors, of which there is at least one."""
+        """Return the moments of (..., d) vectors, at least one."""
         rows = vectors.reshape(-1, vectors.shape[-1]).astype(np.float64)
         mean = rows.mean(axis=0)
         return cls(len(rows), mean, np.square(rows - mean).sum(axis=0))
@@ -170,14 +170,14 @@ class Moments:
 
     @property
     def variance(self) -> np.ndarray:
-        """(d,), of the population."""
+        """Population variance, (d,)."""
         return self.square / self.count
 
 
 def motion_statistics(
     trajectories: Iterable[Iterable[np.ndarray]], periods: Sequence[np.ndarray] | None = None
 ) -> dict[str, np.ndarray]:
-    """Return mean and deviation, (d,), m, of x[t+1] - x[t] and of its differences; trajectories count the same."""
+    """Return mean and deviation, (d,), m, of x[t+1] - x[t] and its differences; trajectories have equal weights."""
     moments = [_of_trajectory(blocks, None if periods is None else periods[k]) for k, blocks in enumerate(trajectories)]
     if not moments:
         raise ValueError("statistics need a trajectory")
@@ -186,7 +186,7 @@ def motion_statistics(
 
 
 def _of_trajectory(blocks: Iterable[np.ndarray], period: np.ndarray | None) -> tuple[Moments, Moments]:
-    """Return the moments of displacements, across periodic faces the shorter ones, and of their differences."""
+    """Return the moments of displacements, unwrapped at periodic faces, and of their differences."""
     velocity = acceleration = None
     before: np.ndarray | None = None
     for block in blocks:
@@ -197,7 +197,7 @@ def _of_trajectory(blocks: Iterable[np.ndarray], period: np.ndarray | None) -> t
             for a in np.flatnonzero(np.isfinite(period)):
                 v[..., a] -= period[a] * np.round(v[..., a] / period[a])
         a = np.diff(v, axis=0)
-        # Of the two frames that are carried over, the displacement was counted already.
+        # The displacement between the two frames that are carried over was already counted.
         new = v if before is None else v[len(before) - 1 :]
         velocity, acceleration = _with(velocity, new), _with(acceleration, a)
         before = joined[-2:]
@@ -215,7 +215,7 @@ def _with(moments: Moments | None, vectors: np.ndarray) -> Moments | None:
 def _over_trajectories(moments: Iterable[Moments]) -> tuple[np.ndarray, np.ndarray]:
     means = np.array([each.mean for each in moments])
     mean = means.mean(axis=0)
-    # The mean squared distance from the overall mean, without a second reading.
+    # The mean squared distance from the overall mean, without a second pass.
     variance = (np.array([each.variance for each in moments]) + np.square(means - mean)).mean(axis=0)
     std = np.sqrt(variance)
     return mean, np.where(std < STD_LEAST, 1.0, std)

@@ -1,4 +1,4 @@
-"""A montage of a dataset: one frame of each of some trajectories, drawn as the frames of one run."""
+"""A montage of a dataset: one frame from each of several trajectories, drawn as the frames of one run."""
 
 import json
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ from mpmcli.scene.colliders import Collider
 
 
 def plan_montage(path: Path, request: Request) -> RenderPlan:
-    """Plan a montage of evenly spaced trajectories, each at one frame; InputError: the request is not possible.
+    """Plan a montage of evenly spaced trajectories, each at one frame; InputError: the request is impossible.
 
     `frames` of the request is N, "first" or "last" for all, None for the middle one of each.
     """
@@ -36,16 +36,16 @@ def plan_montage(path: Path, request: Request) -> RenderPlan:
     columns, rows = parse_grid(request.montage)
     numbers = evenly_spaced(dataset.numbers, columns * rows)
     cells = TrajectoryCells(dataset, numbers, request.frames)
-    # No empty cells, but for those of the last row.
+    # No empty cells, except in the last row.
     columns = min(columns, len(numbers))
     grid, output = f"{columns}x{-(-len(numbers) // columns)}", request.output or path / MONTAGE
     return plan_render(cells, replace(request, frames=None, montage=grid, output=output), cells.captions)
 
 
 class TrajectoryCells(Result):
-    """One frame of each of some trajectories, as the frames of one run that has the bodies of all of them.
+    """One frame from each of several trajectories, as the frames of one run with the bodies of all.
 
-    They share camera, scale and colours. The domain is the box around all; fields are those that all have.
+    They share camera, scale and colours. The domain is the box around all; fields are those common to all.
     """
 
     kind = "packed"
@@ -81,7 +81,7 @@ class TrajectoryCells(Result):
         alike: dict[str, Any] = {}
         bodies: list[BodyHeader] = []
         for header in headers:
-            # The distance of particles is that of the first grid, however fine this one is.
+            # The particle distance refers to the first grid, whatever the spacing of this one.
             finer = (first.spacing / header.spacing) ** header.dimension
             for body in header.bodies:
                 name = appearance_of(body.material.get("law", "material"), dict(body.material)).name
@@ -89,7 +89,7 @@ class TrajectoryCells(Result):
                 bodies.append(_Body(body.name, material, body.volume, body.particles_per_cell * finer, body.density))
         self.header = replace(
             first,
-            # Pictures are drawn again when this changes.
+            # A change of this value causes pictures to be drawn again.
             stored={**first.stored, "scene": json.dumps([title, *self.captions, *scenes])},
             title=title,
             origin=np.min([header.origin for header in headers], axis=0),
@@ -99,7 +99,7 @@ class TrajectoryCells(Result):
 
     @cached_property
     def colliders(self) -> tuple[Collider, ...]:
-        """Those of all trajectories."""
+        """The colliders of all trajectories."""
         return tuple(collider for each in self._trajectories for collider in each.colliders)
 
     def _read(self, k: int, names: Sequence[str]) -> dict[str, np.ndarray]:
@@ -120,7 +120,7 @@ class TrajectoryCells(Result):
 
 @dataclass(frozen=True)
 class _Body(BodyHeader):
-    """A body with the material of the first one that looks like it, and its own density, kg/m^3."""
+    """A body with the material of the first one of the same appearance, and its own density, kg/m^3."""
 
     own_density: float | None = None
 
@@ -130,7 +130,7 @@ class _Body(BodyHeader):
 
 
 def _position(frame: str | None, trajectory: Trajectory) -> int:
-    """Return the position of the frame that a text means in a trajectory."""
+    """Return the index of the frame named by a text in a trajectory."""
     count = trajectory.frame_count
     named = {None: count // 2, "first": 0, "last": count - 1}
     if frame in named:
@@ -146,7 +146,7 @@ def _position(frame: str | None, trajectory: Trajectory) -> int:
 
 def _captions(trajectories: Sequence[Trajectory]) -> tuple[str, ...]:
     """Return the number of each trajectory and those drawn values in which the trajectories differ."""
-    # Placed bodies are lists, and too long.
+    # Placed bodies are lists, which are too long.
     draws = [
         {key: value for key, value in each.draws.items() if not isinstance(value, list | dict)} for each in trajectories
     ]

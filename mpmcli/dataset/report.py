@@ -1,6 +1,6 @@
-"""What a dataset holds, as its manifest and its files tell: counts, reasons, and whether every checksum is right.
+"""Reports on a dataset from its manifest and files: counts, reasons for exclusions, and checksums.
 
-And its card, README.md in its directory: what varies, what was kept, how to load it.
+Also its card, README.md in its directory: distributions, contents, and code that loads it.
 """
 
 import json
@@ -33,13 +33,13 @@ from mpmcli.output.checksums import checksum_is_right
 from mpmcli.output.durable import write_text
 from mpmcli.plain_text import counted, markdown_table, one_line, size_text
 
-# Trajectories that a text names.
+# Largest number of trajectories named in a text.
 MOST_NAMED = 10
 
 
 @dataclass(frozen=True)
 class Status:
-    """Counts of a dataset with `part` (i, n) of a sweep: trajectories `expected` in it, and `rows` of those tried."""
+    """Counts of a dataset with `part` (i, n) of a sweep: `expected` trajectories, and `rows` of those tried."""
 
     path: Path
     part: tuple[int, int]
@@ -71,7 +71,7 @@ class Status:
         }
 
     def lack(self) -> str:
-        """Return what of the sweep is not in the dataset, other than what its verdict excludes, "" if nothing is."""
+        """Return the part of the sweep that the dataset lacks, apart from exclusions by verdict, "" if none."""
         failed, waiting = sum(row.verdict == "failed" for row in self.rows), self.expected - len(self.rows)
         told = [f"{n} {what}" for n, what in ((waiting, "not computed"), (failed, "failed")) if n]
         (i, n), of = self.part, counted(self.expected, "trajectory")
@@ -80,7 +80,7 @@ class Status:
         return f"{self.accepted} of {of} included, {', '.join(told)}" if told else ""
 
     def text(self) -> str:
-        """Return it as text: a line of counts, one for each verdict, and the reasons of the first exclusions."""
+        """Return it as text: a line of counts, a line per verdict, and the reasons of the first exclusions."""
         told = self.as_dict()
         lines = [
             f"{self.path}: {self.accepted} of {counted(self.expected, 'trajectory')} included, "
@@ -96,7 +96,7 @@ class Status:
 
 
 def status_of(path: Path) -> Status:
-    """Read the counts of a dataset; an InputError says that it is none, or that its manifest cannot be read."""
+    """Read the counts of a dataset; InputError: it is not a dataset, or its manifest cannot be read."""
     manifest = Manifest(path)
     facts, rows = manifest.facts(), manifest.rows()
     folder = Folder(path, facts["count"], facts["per_shard"], tuple(facts["part"]))
@@ -105,14 +105,14 @@ def status_of(path: Path) -> Status:
 
 @dataclass(frozen=True)
 class Verification:
-    """Outcome of a comparison of a dataset with its manifest: how many trajectories, and a sentence for each fault."""
+    """Outcome of a comparison of a dataset with its manifest: number of trajectories, and a sentence per fault."""
 
     path: Path
     trajectories: int
     faults: tuple[str, ...]
 
     def as_dict(self) -> dict:
-        """Return it as JSON can hold it."""
+        """Return it for JSON."""
         read = {"trajectories": self.trajectories, "faults": list(self.faults)}
         return {"path": str(self.path), "ok": not self.faults, **read}
 
@@ -123,7 +123,7 @@ class Verification:
 
 
 def verify(path: Path, on_file: Callable[[int, int], None] = lambda done, total: None) -> Verification:
-    """Compare a dataset with its manifest; `on_file` is told files read, and their number, after each."""
+    """Compare a dataset with its manifest; after each file, `on_file` gets the number of files read and the total."""
     status = status_of(path)
     faults = []
     missing = status.expected - len(status.rows)
@@ -161,7 +161,7 @@ def _faults_of(file: Path, rows: list[Row]) -> list[str]:
 
 
 def _trajectory_faults(file: h5py.File, row: Row) -> list[str]:
-    """Compare a trajectory with its row, and with its own checksums."""
+    """Compare a trajectory with its row and its own checksums."""
     it = f"trajectory {row.number} in {file.filename}"
     try:
         stored = StoredGroup(file, row.number)
@@ -180,7 +180,7 @@ def _trajectory_faults(file: h5py.File, row: Row) -> list[str]:
 
 
 CARD, MONTAGE = "README.md", "montage.png"
-# Of a histogram; where values repeat and there are few, each is counted by itself.
+# Bins of a histogram; if there are few distinct values, each is counted separately.
 BINS = 10
 MOST_COUNTED = 6
 LEVELS = "▁▂▃▄▅▆▇█"
@@ -188,10 +188,10 @@ EMPTY = "·"
 
 
 def write_card(directory: Path) -> Path:
-    """Write the card of a dataset of which every trajectory has been tried, and return its path.
+    """Write the card of a dataset whose trajectories have all been tried, and return its path.
 
-    Its bytes depend on the sweep and on the trajectories alone: not on times, machines, interrupts or parts. A
-    picture montage.png that lies in the directory is shown.
+    Its bytes depend on the sweep and the trajectories alone, not on times, machines, interrupts or parts. It shows the
+    picture montage.png if the directory contains one.
     """
     manifest = Manifest(directory)
     facts, rows = manifest.facts(), manifest.rows()
@@ -223,7 +223,7 @@ def write_card(directory: Path) -> Path:
 
 
 def first_paragraph(text: str) -> str:
-    """Return the comment that a TOML file begins with, up to its first empty line; editors' directives are left out."""
+    """Return the first comment of a TOML file up to its first empty line, without editor directives."""
     lines = []
     for line in text.splitlines():
         said = line.removeprefix("#").strip()
@@ -245,11 +245,11 @@ def _range(values: Collection[float], unit: str = "") -> str:
 
 
 def _contents(directory: Path, included: Sequence[Row]) -> str:
-    """Return what the included trajectories have in common, and what they have not: lengths in m, times in s."""
+    """Return the common properties of the included trajectories and the ranges of others: lengths in m, times in s."""
     lowers, uppers = [], []
-    # Of the intervals between frames the shortest and the longest.
+    # The shortest and the longest interval between frames.
     spacings, intervals, durations, laws = set(), set(), set(), set()
-    # What moves: the shape of a particle's value by name.
+    # Arrays over time: the shape of a particle's value by name.
     arrays: dict[str, tuple[int, ...]] = {}
     shards = [directory / name for name in sorted({row.file for row in included})]
     for path in shards:
@@ -302,7 +302,7 @@ def _left_out(rows: Sequence[Row]) -> str:
     lines = []
     for row in rows[:MOST_NAMED]:
         first = (row.reason.splitlines() or [""])[0]
-        # Without the path of the sweep on the machine that computed it.
+        # Omit the path of the sweep on the machine that computed it.
         said = first.partition(f": trajectory {row.number}: ")[2] or first
         lines.append(f"* {row.number}, {row.verdict}: {one_line(said)}")
     if len(rows) > MOST_NAMED:
@@ -311,7 +311,7 @@ def _left_out(rows: Sequence[Row]) -> str:
 
 
 def _drawn(sweep: Mapping[str, Any], included: Sequence[Row]) -> str:
-    """Return a table of the keys that vary, and what the included trajectories have drawn."""
+    """Return a table of the varying keys, and of the drawn values of the included trajectories."""
     components: dict[str, DrawnComponent] = {}
     for row in included:
         for label, source, value in values_of(sweep, json.loads(row.draws)):
@@ -384,7 +384,7 @@ class DrawnComponent:
         self._texts: Counter[str] = Counter()
 
     def add(self, value: Any) -> None:
-        """Count a value: a finite number, or anything else that JSON holds."""
+        """Count a value: a finite number, or any other JSON value."""
         if isinstance(value, int | float) and not isinstance(value, bool):
             self._numbers.append(value)
         else:
@@ -392,13 +392,13 @@ class DrawnComponent:
 
     @property
     def row(self) -> tuple[str, ...]:
-        """Label, source, minimum, mean, maximum and distribution, as text; "" where there is none."""
+        """Label, source, minimum, mean, maximum and distribution, as text; "" if there is none."""
         ends = ("", "", "")
         if self._numbers and not self._texts:
-            # The exact sum does not depend on the order.
+            # The exact sum is independent of the order.
             mean = math.fsum(self._numbers) / len(self._numbers)
             ends = (number_text(min(self._numbers)), number_text(mean), number_text(max(self._numbers)))
-        # Sorted as numbers; a key that draws texts has few of them.
+        # Sorted as numbers; a key that draws texts has few distinct ones.
         counts = Counter(map(number_text, sorted(self._numbers))) + self._texts
         repeated = len(counts) < max(len(self._numbers), 2)
         if (len(counts) <= MOST_COUNTED and repeated) or self._texts:
@@ -410,7 +410,7 @@ class DrawnComponent:
 
 
 def histogram(values: Sequence[float]) -> str:
-    """Return bars of equal bins from the smallest to the largest value, which differ, as high as their counts."""
+    """Return bars with heights proportional to the counts in equal bins from the smallest to the largest value."""
     low, high = min(values), max(values)
     counts = [0] * BINS
     for value in values:
@@ -458,7 +458,7 @@ def _components(key: str, table: Any, value: Any) -> Iterator[tuple[str, str, An
 
 
 def _source(table: Any, component: int | None = None) -> str:
-    """Write a distribution as the sweep file does; of one with bounds for each component, those of one."""
+    """Write a distribution as in the sweep file; with a `component`, only the bounds of that one."""
     if not isinstance(table, dict):
         return json.dumps(table)
 

@@ -1,4 +1,4 @@
-"""A shard: one HDF5 file with some trajectories of a dataset, whose bytes depend on its content alone.
+"""A shard: one HDF5 file with several trajectories of a dataset; its bytes depend on the content alone.
 
 /                     format = "mpmcli-dataset", version = 2
 /000007               number, split, draws (JSON), header (JSON, see `RunHeader`)
@@ -8,7 +8,7 @@
 /000007/ledger/mass   and every other column of the ledger, T rows
 /000007/checksums     of each frame and of all else, see `output/checksums.py`
 
-The last bytes of the file are a checksum of all before (`output/checksums.py`).
+The last bytes of the file are a checksum of all bytes before them (`output/checksums.py`).
 """
 
 import json
@@ -46,9 +46,9 @@ LEDGER = "ledger"
 # The files of a dataset, and its directories.
 SWEEP, BASE = "sweep.toml", "base.toml"
 SHARDS, PENDING, QUARANTINE = "shards", "pending", "quarantine"
-# Of HDF5 for a data set and for a group, at most.
+# Largest overhead of HDF5 for a data set and for a group, bytes.
 TABLE_BYTES, GROUP_BYTES = 1024, 16 * 1024
-# Of a compressed chunk: as much as HDF5 caches of a dataset.
+# Bytes of a compressed chunk: the size of HDF5's cache of a data set.
 CHUNK_BYTES = 2**20
 
 
@@ -57,10 +57,9 @@ class TrajectoryData:
     """One trajectory of T frames with N particles each.
 
     Attributes:
-        number: in the dataset, from 0; split: "train", "valid" or "test".
-        draws: what was drawn, by the key of the scene; header: `RunHeader.stored`. JSON can hold both.
-        position, velocity: (T, N, d) float32 or float64, m and m/s.
-        body, material: (N,), indices into the bodies and laws of the header.
+        number: number in the dataset, from 0; split: "train", "valid" or "test". draws: drawn values, by the key of the
+            scene; header: `RunHeader.stored`. Both are valid JSON. position, velocity: (T, N, d) float32 or float64, m
+            and m/s. body, material: (N,), indices into the bodies and laws of the header.
         time: (T,), s; step, frame: (T,), time steps since the start, and number of the frame; ledger: T rows.
         fields: further arrays of `output.fields`, (T, N) or (T, N, ...), by name.
     """
@@ -81,7 +80,7 @@ class TrajectoryData:
 
     @cached_property
     def arrays(self) -> dict[str, np.ndarray]:
-        """All arrays as they are stored, by their path in the group."""
+        """All arrays as stored, by their path in the group."""
         arrays = {"position": self.position, "velocity": self.velocity, **self.fields}
         arrays |= {name: np.asarray(getattr(self, name), np.int32) for name in LABELS}
         for name, dtype in (("time", np.float64), ("step", np.int64), ("frame", np.int64)):
@@ -95,12 +94,12 @@ def group_name(number: int) -> str:
 
 
 def file_name(number: int) -> str:
-    """Return the name of the file of a single trajectory, before it is in a shard or in quarantine."""
+    """Return the file name of a single trajectory, before it enters a shard, or in quarantine."""
     return f"{group_name(number)}.h5"
 
 
 def write_trajectory(file: h5py.File, data: TrajectoryData, *, compress: bool = False) -> None:
-    """Add a trajectory to an open shard, its bytes by content alone; ValueError: it contradicts itself, or is there."""
+    """Add a trajectory to an open shard; ValueError: it is inconsistent, or already present."""
     if fault := _fault(data):
         raise ValueError(f"trajectory {data.number}: {fault}")
     file.attrs["format"], file.attrs["version"] = FORMAT, VERSION
@@ -119,7 +118,7 @@ def write_trajectory(file: h5py.File, data: TrajectoryData, *, compress: bool = 
 
 
 def join_trajectories(files: Mapping[int, Path], path: Path) -> None:
-    """Write a shard with trajectories by number, each from a file of its own."""
+    """Write a shard of trajectories by number, each from its single file."""
     with h5py.File(path, "w") as joined:
         joined.attrs["format"], joined.attrs["version"] = FORMAT, VERSION
         for number, file in files.items():
@@ -139,7 +138,7 @@ def _attributes(data: TrajectoryData) -> dict[str, int | str]:
 
 
 def write_single(path: Path, data: TrajectoryData, *, compress: bool) -> str:
-    """Write a shard with this trajectory alone in one durable step, and return the checksum of the trajectory."""
+    """Write a shard with this trajectory alone, in one durable step, and return the checksum of the trajectory."""
     attributes = sum(len(str(value)) for value in _attributes(data).values())
     # Without compression, rounded up.
     size = sum(array.nbytes + TABLE_BYTES for array in data.arrays.values()) + attributes + GROUP_BYTES
@@ -151,7 +150,7 @@ def write_single(path: Path, data: TrajectoryData, *, compress: bool) -> str:
 
 
 def checksum(group: h5py.Group) -> str:
-    """Return the SHA-256, hexadecimal, of all that a trajectory's group holds, compressed or not."""
+    """Return the SHA-256, hexadecimal, of the content of a trajectory's group, independent of compression."""
     names: list[str] = []
     group.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None)
     return _checksum(group.attrs, ((name, group[name][...]) for name in sorted(names) if name != CHECKSUMS))
@@ -169,12 +168,12 @@ def _checksum(attributes: Mapping[str, Any], arrays: Iterable[tuple[str, np.ndar
 
 @contextmanager
 def open_shard(path: Path) -> Iterator[h5py.File]:
-    """Open a sealed shard for reading; an InputError says that it, or what is read from it, is missing or damaged."""
+    """Open a sealed shard for reading; InputError: the shard or an item in it is missing or damaged."""
     if not path.exists():
         raise InputError(f"{path} is missing: the dataset is not complete.")
     with opened(path, "a whole copy of the dataset") as file:
         if file.attrs.get("format") != FORMAT:
-            raise InputError(f"{path} is no shard of a dataset of mpmcli: its format is not {FORMAT}.")
+            raise InputError(f"{path} is not a shard of a dataset of mpmcli: its format is not {FORMAT}.")
         require_format(path, file.attrs["version"], VERSION)
         yield file
 
@@ -206,7 +205,7 @@ def _storage(array: np.ndarray) -> dict[str, Any]:
 
 
 class StoredGroup:
-    """A trajectory's group, compared with checksums as it is read; KeyError: there is none; InputError: it changed."""
+    """A trajectory's group, verified by checksums as it is read; KeyError: there is none; InputError: it changed."""
 
     def __init__(self, file: h5py.File, number: int) -> None:
         self.group: h5py.Group = file[group_name(number)]
@@ -233,7 +232,7 @@ class StoredGroup:
         return found
 
     def require_all(self) -> None:
-        """Compare the checksums of all that the group holds."""
+        """Compare the checksums of all items of the group."""
         for name in self._checksums.arrays:
             self.frames(name, slice(None))
         items = checksums.item_checksums(self.group, self._checksums.arrays, CHECKSUMS)

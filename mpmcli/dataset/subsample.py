@@ -1,4 +1,4 @@
-"""A trajectory as an export takes it: every K-th frame, at most M particles, and particles on walls."""
+"""A trajectory as exported: every K-th frame, at most M particles, and particles on walls."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -16,15 +16,15 @@ from mpmcli.scene.primitives import Box
 from mpmcli.scene.rigid import Path
 from mpmcli.scene.surface import collider_surface, form_surface, surface_points
 
-# Of colliders, or of the domain as well.
+# Walls with particles: none, colliders, or colliders and the domain.
 Walls = Literal["none", "colliders", "all"]
-# What a particle on a wall is part of: what rests, what moves as the scene says, or what moves freely.
+# Kinds of wall of a particle: at rest, with prescribed motion, or moving freely.
 KINDS = ("wall", "moving_wall", "rigid_body")
-# The number in place of that of a collider, of the walls of the domain.
+# Number of the walls of the domain, in place of that of a collider.
 DOMAIN = -1
-# Distance in spacings to which a point is on a surface.
+# Distance in spacings up to which a point is on a surface.
 ON_SURFACE = 0.01
-# Of the random choice of particles, together with the number of the trajectory.
+# Seed of the random choice of particles, together with the number of the trajectory.
 SEED = 0
 BLOCK_BYTES = 64 * 2**20
 
@@ -40,7 +40,7 @@ class WallParticles:
 
     @cached_property
     def _parts(self) -> list[tuple[int, np.ndarray, Motion | Path | None]]:
-        """Number, points (n, d) and motion of each wall; None for one that rests, whose points lie where they are."""
+        """Number, initial points (n, d) and motion of each wall; the motion is None for a wall at rest."""
         found: list[tuple[int, np.ndarray, Motion | Path | None]] = []
         header = self.header
         if self.walls == "none" or header.origin is None:
@@ -54,7 +54,7 @@ class WallParticles:
         if self.walls == "all":
             box = form_surface(Box.model_construct(min=tuple(header.origin), max=tuple(header.upper)))
             points = surface_points(box, self.spacing)
-            # Periodic faces are no walls.
+            # Periodic faces are not walls.
             on_face = np.isclose(points, header.origin) | np.isclose(points, header.upper)
             found.append((DOMAIN, points[(on_face & ~header.periodic).any(axis=1)], None))
         return [
@@ -63,7 +63,7 @@ class WallParticles:
         ]
 
     def _seen(self, number: int, points: np.ndarray) -> np.ndarray:
-        """Leave out points (n, d) of a wall at rest that lie inside of another collider at rest."""
+        """Remove points (n, d) of a wall at rest that lie inside another collider at rest."""
         seen = np.ones(len(points), bool)
         for other in self.colliders:
             if not other.motion.moves and self.header.collider_names.index(other.name) != number:
@@ -81,17 +81,17 @@ class WallParticles:
 
     @property
     def numbers(self) -> np.ndarray:
-        """The collider of each particle by its number in the scene, (W,) int32; -1 of the domain."""
+        """Number in the scene of the collider of each particle, (W,) int32; -1 for the domain."""
         return np.repeat(np.array([number for number, _, _ in self._parts], np.int32), self._sizes)
 
     @property
     def kinds(self) -> np.ndarray:
-        """What each particle is part of, an index into KINDS, (W,) int."""
+        """Kind of wall of each particle, an index into KINDS, (W,) int."""
         kinds = [0 if motion is None else 2 if isinstance(motion, Path) else 1 for _, _, motion in self._parts]
         return np.repeat(np.array(kinds, int), self._sizes)
 
     def positions(self, times: Sequence[float]) -> np.ndarray:
-        """Return where they are at some times, s: (T, W, d) float64, m."""
+        """Return the positions at some times, s: (T, W, d) float64, m."""
         found = np.empty((len(times), self.count, self.header.dimension))
         first = 0
         for _, points, motion in self._parts:
@@ -102,9 +102,10 @@ class WallParticles:
 
 
 class SubsampledTrajectory:
-    """Every `stride`-th frame, and at most `most` particles, of a `source`; those on `walls` do not count.
+    """Every `stride`-th frame, and at most `most` particles, of a `source`, not counting those on `walls`.
 
-    They are the same in all frames and exports: of each body its share at random. The ledger is of all particles.
+    The particles are chosen at random, in proportion for each body, and are the same in all frames and exports. The
+    ledger is of all particles.
     """
 
     def __init__(
@@ -142,7 +143,7 @@ class SubsampledTrajectory:
 
     @property
     def spacing(self) -> float | None:
-        """Largest distance of neighbours at the start, m, as of a coarser lattice where thinned; None: not known."""
+        """Largest initial distance of neighbours, m, as of a coarser lattice if thinned; None: unknown."""
         header = self.source.header
         if header.spacing is None or not header.bodies:
             return None
@@ -182,7 +183,7 @@ class SubsampledTrajectory:
             first += len(block)
 
     def ledger(self) -> list[LedgerRow]:
-        """Return a row for each frame: what is counted since the frame before is that of all frames between them."""
+        """Return a row for each frame; counts since the previous frame include the omitted frames between them."""
         rows = self.source.ledger
         found = []
         for k in range(0, len(rows), self.stride):
@@ -192,7 +193,7 @@ class SubsampledTrajectory:
 
 
 def joined_row(rows: Sequence[LedgerRow], before: float) -> LedgerRow:
-    """Return the row of the last of consecutive frames, as if those before it had not been stored; `before` in s."""
+    """Return the row of the last of consecutive frames, as if the others had not been stored; `before` in s."""
     if len(rows) == 1:
         return rows[0]
     spans = np.diff([before, *(row.time for row in rows)])
@@ -215,9 +216,9 @@ def joined_row(rows: Sequence[LedgerRow], before: float) -> LedgerRow:
 
 
 def chosen_particles(body: np.ndarray, most: int, number: int) -> np.ndarray:
-    """Choose `most` of N labels at random, of each body its share, always the same: ascending indices, (most,)."""
-    # Labels at equal distances in the order of the bodies, and at random within each: of each body, and of bodies in a
-    # row, as many as their share, to less than one.
+    """Choose `most` of N labels at random, in proportion for each body: ascending indices, (most,); deterministic."""
+    # Labels at equal distances in the order of the bodies, random within each: every body, and every run of consecutive
+    # bodies, gets its share to less than one.
     keys = np.random.default_rng([SEED, number]).random(len(body))
     order = np.lexsort((keys, body))
     return np.sort(order[((np.arange(most) + 0.5) * len(body) / most).astype(int)])

@@ -1,4 +1,4 @@
-"""What a sweep file says, read and complete: its tables, its distributions, and what a trajectory draws."""
+"""The model of a sweep: its tables, its distributions, and the draws of a trajectory."""
 
 import json
 import math
@@ -16,42 +16,42 @@ from pydantic import Field, PlainValidator, model_validator
 from mpmcli.scene.problem import listed, nearest, quoted, written
 from mpmcli.scene.quantity import AXES, LARGEST, Integer, NotNegative, Number, Table, flaw, list_of_axes
 
-# A normal distribution that says no bounds ends at so many standard deviations.
+# Default bounds of a normal distribution, in standard deviations.
 USUAL_DEVIATIONS = 3.0
 Method = Literal["random", "sobol", "latin"]
 Accepted = Literal["stable", "suspect"]
 _KINDS = ["uniform", "loguniform", "normal", "integers", "choice", "grid"]
 # 2^64 / golden ratio, made odd.
 GOLDEN = 0x9E3779B97F4A7C15
-# Trajectories among which purposes are divided.
+# Number of consecutive trajectories that are divided among the splits.
 TOGETHER = 10
 ROUND_OFF = 1e-9
 
 
 @dataclass(frozen=True)
 class Distribution:
-    """What one key of a sweep is drawn from.
+    """The distribution of one key of a sweep.
 
     Attributes:
         continuous: whether the value depends continuously on u; such values are drawn by the sweep's method.
-        components: number of u that a value needs.
+        components: number of components of u that a value needs.
     """
 
     continuous: ClassVar[bool] = False
     components: ClassVar[int] = 0
 
     def value(self, u: Sequence[float]) -> Any:
-        """Return the value at u, `components` numbers in [0, 1); plain Python, as TOML holds it."""
+        """Return the value at u, `components` numbers in [0, 1), as a plain Python value for TOML."""
         raise NotImplementedError
 
     def extremes(self) -> list[Any]:
-        """Return the values at both ends; all values where they have no order."""
+        """Return the values at both ends; all values if they have no order."""
         raise NotImplementedError
 
 
 @dataclass(frozen=True)
 class Choice(Distribution):
-    """One of some values, each as likely; of a single one that."""
+    """One of several values with equal probability; a constant if there is only one."""
 
     components = 1
     values: tuple[Any, ...]
@@ -65,7 +65,7 @@ class Choice(Distribution):
 
 @dataclass(frozen=True)
 class Grid(Distribution):
-    """Values in turn: trajectories run through the combinations of all grids of a sweep."""
+    """Values in order: trajectories run through the combinations of all grids of a sweep."""
 
     values: tuple[Any, ...]
 
@@ -75,7 +75,7 @@ class Grid(Distribution):
 
 @dataclass(frozen=True)
 class Numbers(Distribution):
-    """A number, or a vector of independent ones; the last two `parameters` of each are smallest and largest value."""
+    """A number, or a vector of independent ones; the last two `parameters` of each are its bounds."""
 
     continuous = True
     parameters: tuple[tuple[float, ...], ...]
@@ -96,12 +96,12 @@ class Numbers(Distribution):
 
     @staticmethod
     def quantile(u: float, *parameters: float) -> float:
-        """Return where the cumulative distribution of one component is u."""
+        """Return the quantile u of one component."""
         raise NotImplementedError
 
 
 class Uniform(Numbers):
-    """As likely everywhere between two bounds."""
+    """Uniform between two bounds."""
 
     @staticmethod
     def quantile(u: float, low: float, high: float) -> float:
@@ -117,7 +117,7 @@ class LogUniform(Numbers):
 
 
 class Integers(Numbers):
-    """Whole numbers, both bounds included, each as likely; below 2^53, so that no rounding skips one."""
+    """Uniform whole numbers, both bounds included; below 2^53, so that rounding skips none."""
 
     continuous = False
 
@@ -127,13 +127,13 @@ class Integers(Numbers):
 
 
 class Normal(Numbers):
-    """Normal, cut off at two bounds: the density between them is that of the whole one, scaled."""
+    """Normal, truncated at two bounds."""
 
     @staticmethod
     def quantile(u: float, mean: float, deviation: float, low: float, high: float) -> float:
         """mean + std Phi^-1(Phi(a) + u (Phi(b) - Phi(a))), with a and b the bounds in standard deviations."""
         a, b = (low - mean) / deviation, (high - mean) / deviation
-        # In the upper tail Phi rounds to 1, so that both tails are computed in the lower one.
+        # Phi rounds to 1 in the upper tail, so both tails are computed in the lower one.
         sign = 1.0 if a + b <= 0 else -1.0
         from_a, from_b = cumulative_normal(sign * a), cumulative_normal(sign * b)
         p = min(max(from_a + u * (from_b - from_a), math.ulp(0.0)), 1.0 - math.ulp(0.5))
@@ -146,12 +146,12 @@ def cumulative_normal(z: float) -> float:
 
 
 def read_distribution(value: object) -> Distribution:
-    """Return the distribution that a value of a sweep file means.
+    """Return the distribution given by a value of a sweep file.
 
-    `uniform = [lo, hi]`, `loguniform = [lo, hi]`, `integers = [lo, hi]` with both bounds, `normal = [mean, std]`
-    with `within = [min, max]` (default: three standard deviations either side), `choice = [values]`, `grid =
-    [values]`; what is no table is a constant. Where both bounds are lists of equal length, the value is a list
-    with independent components. A flaw is raised for pydantic to report.
+    `uniform = [lo, hi]`, `loguniform = [lo, hi]`, `integers = [lo, hi]` with both bounds, `normal = [mean, std]` with
+    `within = [min, max]` (default: three standard deviations either side), `choice = [values]`, `grid = [values]`; a
+    value that is not a table is a constant. Where both bounds are lists of equal length, the value is a list with
+    independent components. Faults are raised for pydantic to report.
     """
     if not isinstance(value, dict):
         return Choice((value,))
@@ -205,7 +205,7 @@ def _two(given: object, key: str) -> tuple[list[Any], list[Any]]:
 
 
 def is_number(value: object) -> bool:
-    """Say whether a value is a finite number that can be computed with."""
+    """Return whether a value is a finite number within the supported range."""
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST
 
 
@@ -230,7 +230,7 @@ def _bounded(
 
 
 def generator(seed: int, number: int, key: str) -> np.random.Generator:
-    """Return the random numbers of one key of one trajectory; no other key and no other trajectory shares them.
+    """Return a generator of random numbers for one key of one trajectory, independent of all others.
 
     Philox (J. K. Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC11), seeded by the sweep's seed,
     the trajectory's number, and the first 128 bits of the SHA-256 of the key.
@@ -240,7 +240,7 @@ def generator(seed: int, number: int, key: str) -> np.random.Generator:
 
 
 def joint_point(method: Method, seed: int, number: int, dimension: int, count: int) -> list[float]:
-    """Return the point of a trajectory in the unit cube that all continuous components of a sweep share.
+    """Return the point of a trajectory in the unit cube of all continuous components of a sweep.
 
     It is point `number` of the scrambled Sobol sequence (A. B. Owen 1998), which does not depend on the count, or row
     `number` of a Latin hypercube of `count` points. The seed is that of the scrambling, or of the hypercube.
@@ -250,7 +250,7 @@ def joint_point(method: Method, seed: int, number: int, dimension: int, count: i
     from scipy.stats import qmc
 
     sequence = qmc.Sobol(dimension, scramble=True, rng=seed)
-    if number:  # SciPy cannot go forward by nothing.
+    if number:  # SciPy cannot advance by 0.
         sequence.fast_forward(number)
     return sequence.random(1)[0].tolist()
 
@@ -266,7 +266,7 @@ Drawn = Annotated[Distribution, PlainValidator(read_distribution)]
 
 
 class Region(Table):
-    """A box with faces along the axes that bodies are placed in."""
+    """A box with faces along the axes, in which bodies are placed."""
 
     min: Annotated[list_of_axes(Number), Field(description="Lower corner, m.")]
     max: Annotated[list_of_axes(Number), Field(description="Upper corner, m.")]
@@ -280,7 +280,7 @@ class Region(Table):
 
 
 class Placement(Table):
-    """Bodies or colliders that take the place of one of the base scene, at random within a region."""
+    """Bodies or colliders that replace one of the base scene, at random positions in a region."""
 
     body: Annotated[
         str | None, Field(description="Name of a body of the base scene, a box or a ball: the template.")
@@ -316,12 +316,12 @@ class Placement(Table):
 
     @property
     def key(self) -> str:
-        """The key of what is placed among the drawn values."""
+        """The key of the placed entries among the drawn values."""
         return f"place.{self.template}" if self.collider is None else f"place.colliders.{self.template}"
 
     @property
     def distributions(self) -> dict[str, Distribution]:
-        """What is drawn, by the key under which it is drawn, such as `place.sand.size`."""
+        """The distributions by key, such as `place.sand.size`."""
         drawn = {name: getattr(self, name) for name in ("count", "size", "radius", "velocity")}
         return {f"{self.key}.{name}": one for name, one in drawn.items() if one is not None}
 
@@ -330,7 +330,7 @@ Share = Annotated[float, Field(strict=True, ge=0, le=1)]
 
 
 class Split(Table):
-    """Fractions of the trajectories by their purpose; 1 together."""
+    """Fractions of the trajectories by split; their sum is 1."""
 
     train: Annotated[Share, Field(description="Fraction to train with, 0 to 1.")] = 0.0
     valid: Annotated[Share, Field(description="Fraction to choose parameters with, 0 to 1.")] = 0.0
@@ -349,10 +349,10 @@ class SweepTable(Table):
 
     base: Annotated[str, Field(description="The base scene, a TOML file beside the sweep.")]
     count: Annotated[Integer, Field(ge=1, le=10**9, description="Number of trajectories.")]
-    seed: Annotated[Integer, Field(ge=0, le=2**63 - 1, description="Seed of everything that is drawn.")] = 0
-    method: Annotated[Method, Field(description="How continuous distributions of [vary] are drawn.")] = "random"
+    seed: Annotated[Integer, Field(ge=0, le=2**63 - 1, description="Seed of all draws.")] = 0
+    method: Annotated[Method, Field(description="Sampling method of continuous distributions of [vary].")] = "random"
     accept: Annotated[Accepted, Field(description="The worst verdict of a trajectory of the dataset.")] = "stable"
-    vary: Annotated[dict[str, Drawn], Field(description="Keys of the base scene and what they are drawn from.")] = {}  # noqa: RUF012
+    vary: Annotated[dict[str, Drawn], Field(description="Keys of the base scene and their distributions.")] = {}  # noqa: RUF012
     place: Annotated[tuple[Placement, ...], Field(description="Bodies and colliders placed at random.")] = ()
     split: Annotated[Split, Field(description="Fractions of the trajectories by their purpose.")] = Split(
         train=0.8, valid=0.1, test=0.1
@@ -366,7 +366,7 @@ class Sweep:
     Attributes:
         path, text, data: the sweep file, its text, and its parsed TOML; base, base_text, base_data: the same of the
             base scene.
-        count, seed, method, accept, split: as in the file, or the count given in its place.
+        count, seed, method, accept, split: as in the file; count may be replaced.
         vary: distributions by key of the base scene, in the order of the file.
         placements: bodies and colliders placed at random.
     """
@@ -387,9 +387,9 @@ class Sweep:
 
     @cached_property
     def key(self) -> str:
-        """SHA-256, hexadecimal, of the base scene, the sweep and the count, whatever their files look like.
+        """SHA-256, hexadecimal, of the base scene, the sweep and the count, independent of the layout of the files.
 
-        The order of keys in [vary] and of [[place]] counts, as grids and Sobol components follow it.
+        The order of keys in [vary] and of [[place]] matters, because grids and Sobol components follow it.
         """
         vary, place = self.data.get("vary", {}), self.data.get("place", [])
         content = {name: getattr(self, name) for name in ("count", "seed", "method", "accept")}
@@ -399,16 +399,16 @@ class Sweep:
 
     @cached_property
     def distributions(self) -> dict[str, Distribution]:
-        """Everything that is drawn, by key: those of `vary`, then those of the placements, `place.sand.size`."""
+        """All distributions by key: those of `vary`, then those of the placements, such as `place.sand.size`."""
         return self.vary | {key: one for place in self.placements for key, one in place.distributions.items()}
 
     def split_of(self, number: int) -> str:
         """Return "train", "valid" or "test" for a trajectory.
 
-        Of each TOGETHER trajectories in a row one falls into each of as many equal parts of [0, 1], in an order of its
-        own that is drawn from the seed, and so into consecutive intervals as long as the fractions. So a trajectory
-        keeps its purpose when the count grows, each purpose has its fraction of the first n trajectories for every n,
-        up to 3 or so too many or too few, and no grid of values, of whatever length, goes with the purposes.
+        [0, 1] is divided into consecutive intervals as long as the fractions. Each group of TOGETHER consecutive
+        trajectories has one in each of TOGETHER equal parts of [0, 1], in an order drawn from the seed. Therefore a
+        trajectory keeps its split when the count grows, each split has its fraction of the first n trajectories for
+        every n, to within about 3, and no grid of values of any length correlates with the splits.
         """
         group, member = divmod(number, TOGETHER)
         offset, order = _split_order(self.seed, group)
@@ -424,9 +424,9 @@ class Sweep:
 
 @lru_cache(maxsize=64)
 def _split_order(seed: int, group: int) -> tuple[float, tuple[int, ...]]:
-    """Return where the trajectories of a group are in their parts of [0, 1], see `Sweep.split_of`, and their order.
+    """Return the position of the trajectories of a group in their parts of [0, 1], and their order.
 
-    The first is a golden-ratio sequence, which is spread evenly however many groups there are.
+    The position is a golden-ratio sequence, which is spread evenly for any number of groups; see `Sweep.split_of`.
     """
     first = int(generator(seed, 0, "split").integers(2**64, dtype=np.uint64))
     order = generator(seed, group, "split order").permutation(TOGETHER)
@@ -434,11 +434,11 @@ def _split_order(seed: int, group: int) -> tuple[float, tuple[int, ...]]:
 
 
 class TrajectoryValues:
-    """Values of one trajectory; those `given` by the keys of `sweep.distributions` are not drawn."""
+    """Values of one trajectory; those `given`, by the keys of `sweep.distributions`, are not drawn."""
 
     def __init__(self, sweep: Sweep, number: int, given: Mapping[str, Any]) -> None:
         self.sweep, self.number = sweep, number
-        # Of grids the last one changes from each trajectory to the next.
+        # The last grid changes from each trajectory to the next.
         grids, left = {}, number
         for key, grid in reversed(sweep.distributions.items()):
             if isinstance(grid, Grid):

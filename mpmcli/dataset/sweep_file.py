@@ -1,4 +1,4 @@
-"""From a sweep file to a checked sweep, or to one error that names everything wrong with it."""
+"""Loads a checked sweep from a sweep file, or raises one error that lists every fault."""
 
 import copy
 import re
@@ -30,11 +30,11 @@ KINDS = {"bodies": "body", "colliders": "collider"}
 def load_sweep(
     path: str | PathLike[str], *, laws: Laws, count: int | None = None, overrides: Sequence[str] = ()
 ) -> Sweep:
-    """Read a sweep and its base scene from TOML files, and try the scenes that they make.
+    """Read a sweep and its base scene from TOML files, and validate the resulting scenes.
 
-    The base is sought beside the sweep, then in the working directory. Trajectory 0 must be valid, also with each
-    distribution at its ends, one key at a time. `count` replaces that of the file, `overrides` keys of the base scene
-    (`apply_overrides`). InputError has one line per fault: `FILE:LINE: KEY: what is wrong and what would be right`.
+    The base is searched in the directory of the sweep, then in the working directory. Trajectory 0 must be valid, also
+    with each distribution at its ends, one key at a time. `count` replaces that of the file, `overrides` replace keys
+    of the base scene (`apply_overrides`). InputError has one line per fault: `FILE:LINE: KEY: fault and correction`.
     """
     text, data = read_toml(path, "sweep")
     read = data if count is None else {**data, "count": count}
@@ -79,7 +79,7 @@ def _base_file(path: File, text: str, data: dict[str, Any]) -> File:
 
 
 def _as_written(problem: Problem, data: dict[str, Any]) -> Problem:
-    """Take the index out of the path to a placement where the file has one [place] table instead of a list."""
+    """Remove the index from the path of a placement if the file has one [place] table instead of a list."""
     if problem.path[:1] == ("place",) and isinstance(data["place"], dict):
         return Problem(("place", *problem.path[2:]), problem.sentence)
     return problem
@@ -115,7 +115,7 @@ def _misplaced(sweep: Sweep) -> Iterator[Problem]:
 
 
 def _misshapen(place: Placement, path: Path, shape: dict[str, Any]) -> Iterator[Problem]:
-    """Find extents that do not fit the shape of the template, and counts that are none."""
+    """Find extents that do not fit the shape of the template, and invalid counts."""
     form = next((name for name in shape if name not in COMBINED), "shape without a form")
     if form not in ("box", "ball") or set(shape) & set(COMBINED):
         found = f"{form} with others" if set(shape) & set(COMBINED) else form
@@ -150,7 +150,7 @@ def _misshapen(place: Placement, path: Path, shape: dict[str, Any]) -> Iterator[
 
 
 def _owners(sweep: Sweep) -> tuple[dict[Path, Path], list[Problem]]:
-    """Return by path of the base scene where the sweep file sets it, and what is wrong with keys of [vary]."""
+    """Return the place in the sweep file that sets each path of the base scene, and the faults of keys of [vary]."""
     names = {name: [entry["name"] for entry in sweep.base_data.get(name, [])] for name in KINDS}
     problems: list[Problem] = []
     set_by: dict[Path, Path] = {}
@@ -183,7 +183,7 @@ def _owners(sweep: Sweep) -> tuple[dict[Path, Path], list[Problem]]:
 
 
 def _faulty_scenes(sweep: Sweep, laws: Laws, set_by: dict[Path, Path]) -> list[Problem]:
-    """Find problems of trajectory 0, also at the ends of each distribution, where bodies may find no place."""
+    """Find problems of trajectory 0, also at the ends of each distribution, where placement may fail."""
     try:
         usual = _scene_problems(sweep, laws, set_by, {})
     except PlacementError as error:
@@ -208,7 +208,7 @@ def _faulty_scenes(sweep: Sweep, laws: Laws, set_by: dict[Path, Path]) -> list[P
 
 
 def _scene_problems(sweep: Sweep, laws: Laws, set_by: dict[Path, Path], given: dict[str, Any]) -> list[Problem]:
-    """Return problems of trajectory 0, with `given` values, at the paths of the sweep file in `set_by`, or at none."""
+    """Return problems of trajectory 0, with `given` values, at their paths in the sweep file by `set_by`, if any."""
     drawn = draw(sweep, 0, given)
     found: list[Problem] = []
     for problem in scene_problems(drawn.data, laws, drawn.directory):
@@ -219,7 +219,7 @@ def _scene_problems(sweep: Sweep, laws: Laws, set_by: dict[Path, Path], given: d
         owner = next((owner for base, owner in set_by.items() if path[: len(base)] == base), None)
         sentence = problem.sentence if owner else f"{path_text(problem.path)}: {problem.sentence}"
         new = Problem(owner or (), sentence)
-        # The bodies of one placement have the faults of their template each.
+        # Each body of a placement repeats the faults of its template.
         if new not in found:
             found.append(new)
     return found

@@ -1,4 +1,4 @@
-"""Runs a sweep, in a directory that is made or resumed: sends what is missing to workers; or rehearses it."""
+"""Runs a sweep: makes or resumes its directory and sends missing trajectories to workers; or rehearses it."""
 
 import math
 import shutil
@@ -45,17 +45,17 @@ from mpmcli.scene import Scene, estimate_particles
 from mpmcli.scene.sampling import count_particles
 from mpmcli.simulation.engine import Arch
 
-# Trajectories whose sizes give the size of all.
+# Trajectories from which the size of all is estimated.
 SAMPLE = 16
-# Bytes of a trajectory beside its arrays: headers of HDF5 and the scene; times and ledger of a frame.
+# Bytes of a trajectory in addition to its arrays: headers of HDF5 and the scene; times and ledger of a frame.
 HEADER_BYTES, FRAME_BYTES = 11_000, 200
-# Most trajectories of a task, and tasks per worker below which they become shorter.
+# Largest number of trajectories of a task, and number of tasks per worker below which tasks become shorter.
 TASK, GPU_TASK, ROUNDS = 8, 128, 8
-# Trajectories after which every split has some, unless its fraction is smaller than that of one.
+# Trajectories after which no split is empty, unless its fraction is less than one trajectory.
 SURE = 1000
-# Why a trajectory has failed that no worker survived.
-LOST = "every worker that computed it was killed, perhaps for want of memory."
-# Rows of the table of a rehearsal, and faults below it.
+# Reason of failure of a trajectory that killed every worker.
+LOST = "every worker that computed it was killed, perhaps for lack of memory."
+# Largest numbers of rows in the table of a rehearsal, and of faults below it.
 MOST_ROWS, MOST_FAULTS = 20, 10
 
 
@@ -63,8 +63,8 @@ MOST_ROWS, MOST_FAULTS = 20, 10
 class SweepSettings:
     """Settings of a sweep that are not part of its file.
 
-    `workers` are processes here, None for one on each core, or those of a Dask `scheduler` at an address; `part` (i, n)
-    is every n-th shard from the i-th on; arch and threads are of each worker.
+    `workers` is the number of local processes, None for one per core, unless a Dask `scheduler` at an address has them;
+    `part` (i, n) is every n-th shard from the i-th on; arch and threads are for each worker.
     """
 
     directory: Path
@@ -79,10 +79,10 @@ class SweepSettings:
 
 @dataclass
 class SweepState:
-    """How far a sweep is.
+    """The progress of a sweep.
 
     Of `expected` trajectories, `kept` were done by an earlier command; counts, seconds and `particle_steps` are of this
-    one. It is `settled` (done, seconds) when each worker has ended a task; until then kernels compile. The status is
+    command. `settled` (done, seconds) is set when each worker has ended a task; before, kernels compile. The status is
     "running", "finished" or "interrupted".
     """
 
@@ -104,7 +104,7 @@ class SweepState:
 
     @property
     def per_hour(self) -> float:
-        """Trajectories per hour of this command, since it has settled where it has."""
+        """Trajectories per hour of this command, counted since `settled` if set."""
         done, seconds = self.settled if self.settled is not None and self.done > self.settled[0] else (self.kept, 0.0)
         return 3600 * (self.done - done) / (self.seconds - seconds) if self.seconds > seconds else 0.0
 
@@ -114,7 +114,7 @@ class SweepState:
         self.accepted += row.accepted
 
     def as_dict(self) -> dict:
-        """Return it as JSON can hold it."""
+        """Return it for JSON."""
         return {
             "status": self.status,
             "directory": str(self.directory),
@@ -127,7 +127,7 @@ class SweepState:
 
 @contextmanager
 def taken_folder(sweep: Sweep, settings: SweepSettings) -> Iterator[tuple[Folder, Manifest]]:
-    """Make or open a dataset's directory, and keep other sweeps out: one process writes manifest and shards."""
+    """Make or open a dataset's directory and lock it: only one process writes manifest and shards."""
     directory = settings.directory
     if directory.is_dir():
         refuse_locked(directory)
@@ -142,7 +142,7 @@ def taken_folder(sweep: Sweep, settings: SweepSettings) -> Iterator[tuple[Folder
 def open_folder(
     sweep: Sweep, settings: SweepSettings, take: Callable[[], object] = lambda: None
 ) -> tuple[Folder, Manifest]:
-    """Make or resume a dataset's directory; `take` is called before the first file; InputError: it does not suit."""
+    """Make or resume a dataset's directory; call `take` before the first file; InputError: it is unsuitable."""
     directory = settings.directory
     manifest = Manifest(directory)
     if settings.resume and (directory / MANIFEST).exists():
@@ -166,7 +166,7 @@ def open_folder(
     if (directory / MANIFEST).exists():
         raise InputError(f"{directory} holds a dataset: --resume goes on with it, and -o gives another directory.")
     there = [path.name.removesuffix(TEMPORARY_SUFFIX) for path in directory.iterdir()] if directory.is_dir() else [""]
-    # A sweep may have been killed here before it had a manifest.
+    # A sweep may have been killed here before it wrote a manifest.
     begun = {name.removesuffix("-journal") for name in there} <= {SWEEP, BASE, MANIFEST, LOCK}
     if not (settings.resume and begun):
         require_empty(directory)
@@ -177,7 +177,7 @@ def open_folder(
         i, n = settings.part
         shards = math.ceil(sweep.count / per_shard)
         raise InputError(f"--shard {i}/{n} is empty: {sweep.count} trajectories fill {counted(shards, 'shard')}.")
-    # While a shard is sealed, its trajectories lie there twice.
+    # While a shard is sealed, its trajectories are on disk twice.
     needed = size * folder.expected + SHARD_BYTES + SPACE_MARGIN
     free = shutil.disk_usage(next(p for p in (directory, *directory.resolve().parents) if p.exists())).free
     if needed > free:
@@ -188,7 +188,7 @@ def open_folder(
     directory.mkdir(parents=True, exist_ok=True)
     take()
     if not settings.resume:
-        # Another sweep may have come and gone meanwhile.
+        # Another sweep may have started and ended meanwhile.
         require_empty(directory, locked=True)
     facts = {"key": sweep.key, "count": sweep.count, "seed": sweep.seed, "accept": sweep.accept}
     facts["files"] = source_digests(sweep, settings.plugins)
@@ -200,7 +200,7 @@ def open_folder(
 
 
 def discard(directory: Path) -> None:
-    """Remove a dataset, if there is one; InputError: something else is there, or another process writes it."""
+    """Remove a dataset, if there is one; InputError: it is not a dataset, or another process writes it."""
     if directory.is_dir() and any(directory.iterdir()):
         if not (directory / MANIFEST).exists():
             raise InputError(f"{directory} holds no dataset, and --overwrite replaces nothing else.")
@@ -209,7 +209,7 @@ def discard(directory: Path) -> None:
 
 
 def discard_beginning(directory: Path, made: Sequence[Path]) -> None:
-    """Remove a dataset in which no trajectory has been done, and the directories `made` for it, outermost first."""
+    """Remove a dataset without finished trajectories, and the directories `made` for it, outermost first."""
     if not (directory / MANIFEST).exists() or Manifest(directory).rows():
         return
     with take_lock(directory):
@@ -238,7 +238,7 @@ def _per_shard(size: float) -> int:
 
 
 def _bytes_of_trajectories(sweep: Sweep, settings: SweepSettings) -> float:
-    """Return the mean bytes of a trajectory without compression, from the first ones that can be drawn."""
+    """Return the mean bytes of a trajectory without compression, from the first trajectories that can be drawn."""
     laws = load_plugins(settings.plugins)
     sizes, fault = [], None
     for number in range(min(SAMPLE, sweep.count)):
@@ -260,12 +260,13 @@ def run_sweep(
 ) -> SweepState:
     """Compute the missing trajectories of a sweep; the files do not depend on workers, their order, or interrupts.
 
-    `on_progress` is called after each task; `stop` often, and True ends the sweep. InputError, nothing written:
-    directory, settings or disk do not suit. RunError: a file could not be written; what was done is kept.
+    `on_progress` is called after each task; `stop` is called often, and True ends the sweep. InputError, nothing
+    written: directory, settings or disk are unsuitable. RunError: a file could not be written; finished trajectories
+    are kept.
     """
     began = time.perf_counter()
     with ExitStack() as stack:
-        # Nothing is written where there is no scheduler.
+        # Without a scheduler nothing is written.
         joined = stack.enter_context(joined_workers(settings.scheduler)) if settings.scheduler else None
         run = _Run(sweep, settings, *stack.enter_context(taken_folder(sweep, settings)))
         run.seal_complete(run.folder.shards)
@@ -281,7 +282,7 @@ def run_sweep(
 
 
 class _Run:
-    """Enters rows into the manifest, and seals each shard when its last row has come."""
+    """Enters rows into the manifest, and seals each shard after its last row."""
 
     def __init__(self, sweep: Sweep, settings: SweepSettings, folder: Folder, manifest: Manifest) -> None:
         self.sweep, self.settings, self.folder, self.manifest = sweep, settings, folder, manifest
@@ -322,7 +323,7 @@ class _Run:
                 continue
             changed = self.folder.seal(shard, self.rows)
             self._put(changed)
-            # The shard holds them now.
+            # They are in the shard now.
             for row in changed:
                 (self.folder.path / PENDING / file_name(row.number)).unlink(missing_ok=True)
 
@@ -332,13 +333,13 @@ class _Run:
 
 
 def _tasks(sweep: Sweep, settings: SweepSettings, numbers: Sequence[int], workers: int) -> list[Task]:
-    """Split the work: tasks of several trajectories, so that sending takes no time, but enough for all workers."""
-    # A GPU computes the trajectories of a task at once.
+    """Split the work into tasks of several trajectories, to reduce the cost of sending, but enough for all workers."""
+    # A GPU computes the trajectories of a task together.
     most = GPU_TASK if settings.arch not in ("auto", "cpu") else TASK
     size = max(1, min(most, len(numbers) // (ROUNDS * workers)))
     directory = settings.directory.resolve()
     plugins = tuple(path.resolve() for path in settings.plugins)
-    # A worker may have another working directory, and a namesake there.
+    # A worker may have another working directory with a file of the same name.
     sweep = replace(sweep, base=sweep.base.absolute())
     sources = tuple((path, path_digest(path)) for path in source_files(sweep, plugins).values())
     return [
@@ -349,9 +350,9 @@ def _tasks(sweep: Sweep, settings: SweepSettings, numbers: Sequence[int], worker
 
 @dataclass(frozen=True)
 class Rehearsed:
-    """One trajectory: values by key, counts, bytes without compression, seconds, and why it cannot be computed.
+    """One trajectory: values by key, counts, bytes without compression, seconds, and its fault, if any.
 
-    Seconds are those of a thread by the table of costs, 0 where the trajectory cannot be computed.
+    Seconds are those of one thread from the table of costs, 0 if the trajectory cannot be computed.
     """
 
     number: int
@@ -366,7 +367,7 @@ class Rehearsed:
 
 @dataclass(frozen=True)
 class Rehearsal:
-    """Trajectories of a part, the workers that share them, and the splits that no trajectory of the sweep is in."""
+    """Trajectories of a part, the number of workers, and the splits without trajectories in the sweep."""
 
     trajectories: tuple[Rehearsed, ...]
     workers: int
@@ -384,16 +385,16 @@ class Rehearsal:
 
     @property
     def seconds(self) -> float | None:
-        """Expected wall time, None where none can be computed."""
+        """Expected wall time, None if no trajectory can be computed."""
         return sum(one.seconds for one in self.trajectories) / self.workers or None
 
     def as_dict(self) -> dict:
-        """Return it as JSON can hold it."""
+        """Return it for JSON."""
         whole = {"ok": self.passes, "trajectories": [vars(one) for one in self.trajectories], "bytes": self.bytes}
         return {**whole, "seconds": self.seconds, "workers": self.workers}
 
     def text(self) -> str:
-        """Return it as text: the first draws, what cannot be computed, and the forecast."""
+        """Return it as text: the first draws, the faults, and the forecast."""
         shown = self.trajectories[:MOST_ROWS]
         keys = list(dict.fromkeys(key for one in shown for key in one.values))
         rows = []
@@ -407,7 +408,7 @@ class Rehearsal:
         faults = [one for one in self.trajectories if one.fault]
         lines += [f"error: trajectory {one.number}: {one.fault}" for one in faults[:MOST_FAULTS]]
         if len(faults) > MOST_FAULTS:
-            lines.append(f"error: {len(faults) - MOST_FAULTS} more cannot be computed; --json tells why")
+            lines.append(f"error: {len(faults) - MOST_FAULTS} more cannot be computed; --json has the reasons")
         time_text = "" if self.seconds is None else f", about {duration_text(self.seconds)}"
         total, workers = counted(len(self.trajectories), "trajectory"), counted(self.workers, "worker")
         lines += [f'note: no trajectory is in the split "{name}": raise count' for name in self.empty]
@@ -440,7 +441,7 @@ def rehearse(sweep: Sweep, settings: SweepSettings) -> Rehearsal:
 
 
 def _short(value: Any) -> str:
-    """Write a drawn value with few digits; of placed bodies their number."""
+    """Write a drawn value with few digits, or the number of placed bodies."""
     if isinstance(value, list) and value and isinstance(value[0], dict):
         return str(len(value))
     if isinstance(value, list):

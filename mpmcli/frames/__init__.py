@@ -1,1 +1,1 @@
-"""What a run yields at each output time: a frame of particles and a row of the ledger."""
+"""The output of a run at each output time: a frame of particles and a row of the ledger."""

@@ -9,7 +9,7 @@ STATUS = "status"
 
 @dataclass(frozen=True)
 class Frame:
-    """State of all n particles at one output time; row i is always particle i, but where others are dropped.
+    """State of all n particles at one output time; row i is particle i unless absent particles are dropped.
 
     Attributes:
         index: number of the frame, 0 for the initial state.
@@ -19,9 +19,9 @@ class Frame:
         velocity: (n, d), m/s.
         body: (n,) int32, index into the scene's bodies.
         material: (n,) int32, index into the run's list of laws.
-        fields: further arrays of the scene's `output.fields`, (n,) or (n, k), by name; and where particles come and
-            go `STATUS`, (n,) int8: 0 waiting, 1 there, 2 gone, 3 kept out.
-        id: (n,), number of each particle where only some are in the frame; None where row i is particle i.
+        fields: further arrays of the scene's `output.fields`, (n,) or (n, k), by name; and if particles come and go,
+            `STATUS`, (n,) int8: 0 waiting, 1 present, 2 gone, 3 kept out.
+        id: (n,), number of each particle if only some are in the frame; None if row i is particle i.
     """
 
     index: int
@@ -36,12 +36,12 @@ class Frame:
 
     @property
     def present(self) -> np.ndarray | None:
-        """Which particles are there, neither waiting nor gone, (n,) bool; None where all always are."""
+        """Whether each particle is present, neither waiting nor gone, (n,) bool; None if all always are."""
         return self.fields[STATUS] == 1 if STATUS in self.fields else None
 
     @property
     def of_present(self) -> "Frame":
-        """The frame of those that are there alone."""
+        """Return the frame of the particles present."""
         rows = self.present
         if rows is None:
             return self

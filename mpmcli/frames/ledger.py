@@ -1,10 +1,10 @@
-"""One row of the run-time ledger: what happened up to a frame, and what is conserved there."""
+"""One row of the ledger of a run: events up to a frame, and conserved quantities at it."""
 
 from dataclasses import dataclass
 
-# Of each collider, and of each pair of bodies that separate.
+# Entries per collider, and per pair of bodies that separate.
 LOADS = ("collider_force", "collider_torque", "contact_force", "contact_torque")
-# Of each collider that moves freely.
+# Entries per free collider.
 RIGID = ("rigid_pose", "rigid_motion")
 
 
@@ -28,22 +28,20 @@ class LedgerRow:
         linear_momentum: sum m v, kg m/s, one number per axis.
         angular_momentum: sum m x cross v + m h^2/4 axl(C) about the origin of the domain,
             kg m^2/s, one number in 2D and three in 3D.
-        volume_error: volume of the cells inside liquids and grains over that of the particles in them, less 1; 0 where
-            hardly any cell is inside.
-        collider_force, collider_torque: on each collider, N, and about its pivot, N m: means since the previous frame
-            of the momentum that it took from the material (0 at frame 0); per metre of depth in 2D.
-        contact_force, contact_torque: of each pair of bodies of which one has a velocity field of its own, see
-            `Scene.contact_pairs`, on the first by the second, N, and about the origin of the domain, N m: means, too.
-        contact_overlap, contact_gap: deepest overlap of surfaces that met, and their largest gap while they acted on
-            each other, since the previous frame, in cells; None where no body separates.
-        rigid_pose: of each collider that moves freely its centre, m, and its angle, rad, or its unit quaternion, the
-            real part first; rigid_motion: its velocity, m/s, and its angular velocity, rad/s. Its energies are in
-            those above, its momenta are not.
-        emitted, retired: particles that emitters have let in so far, and that left through open faces; emitted_mass,
-            retired_mass: theirs, kg. Sums are over those that are there.
-        blocked: particles of emitters that found their place occupied so far: they stay out for good, but where they
-            are half of a sheet or more, which then waits.
-            These five are None where no particle comes or goes.
+        volume_error: volume of the cells inside liquids and grains over that of the particles in them, minus 1; 0 if
+            hardly any cell is inside. collider_force, collider_torque: on each collider, N, and about its pivot, N m:
+            means since the previous frame of the momentum that it took from the material (0 at frame 0); per metre of
+            depth in 2D. contact_force, contact_torque: for each pair of bodies of which one has a velocity field of its
+            own, see `Scene.contact_pairs`, means of the force on the first by the second, N, and about the domain's
+            origin, N m. contact_overlap, contact_gap: deepest overlap of surfaces that met, and their largest gap while
+            they acted on each other, since the previous frame, in cells; None if no body separates.
+        rigid_pose: centre of each free collider, m, and its angle, rad, or its unit quaternion, the real part first;
+            rigid_motion: its velocity, m/s, and its angular velocity, rad/s. Its energies are included in those above,
+                its momenta are not. emitted, retired: particles that have entered from emitters so far, and that have
+                left through open faces; emitted_mass, retired_mass: their mass, kg. Sums are over the particles
+                present. blocked: particles of emitters that have found their place occupied so far. They never enter,
+                unless they are half of a sheet or more, which then waits. These five are None if no particle comes or
+                goes.
 
     Velocities are those of the middle of the last step before `time`.
     """

@@ -78,9 +78,9 @@ class HenckyParameters(ElasticParameters):
 def soft_youngs_modulus(parameters: HenckyParameters, bounds: SceneBounds) -> float:
     """Return Young's modulus E, Pa, for which weight and speed in these bounds strain the volume by `compressibility`.
 
-    The pressure of the deepest column and of the fastest flow is density (g H + v^2), where the density is the
-    largest of what can reach the body. The bulk modulus K = lambda + 2 mu / d (in 2D that of the plane) is
-    proportional to E.
+    The pressure of the deepest column and of the fastest flow is density (g H + v^2), with the largest density of all
+    bodies that can reach this one. The bulk modulus K = lambda + 2 mu / d (in 2D that of the plane) is proportional to
+    E.
     """
     speed = bounds.speed if bounds.speed > 0 else QUIET_SPEED
     pressure = max(parameters.density, bounds.density) * (bounds.gravity * bounds.height + speed**2)
@@ -96,17 +96,17 @@ class HenckyLaw(Law):
     """
 
     deformation = "F"
-    # d lambda + 2 mu at any strain; x coth x = 1 + x^2/3 for shear. Bulk is stiffer than that below J = 0.4 or so only,
-    # which measurements at the longest interval find.
+    # d lambda + 2 mu at any strain; x coth x = 1 + x^2/3 for shear. Only below about J = 0.4 is bulk stiffer, which
+    # measurements at the longest interval detect.
     sensitivity = 0.0
 
     def modes(self, parameters: HenckyParameters, bound: StateBound) -> list[Mode]:
         """Return d lambda + 2 mu for normal strain, 2 mu x coth x for shear, x = ln(s_i / s_j), and that of bulk.
 
-        Under C dt the normal strains change by the normal entries of C dt. In a pair of shear entries
-        tau_ij = (tau_i - tau_j) / (s_i^2 - s_j^2) b_ij, where b_ij changes by (C_ij s_j^2 + C_ji s_i^2) dt.
-        Plastic flow only reduces the differences tau_i - tau_j. A particle alone is as stiff in any state; in bulk
-        waves see the pressure too (`carried_stiffness`): -tau_i = -2 mu e_i - lambda ln J.
+        Under C dt the normal strains change by the normal entries of C dt. In a pair of shear entries tau_ij = (tau_i -
+        tau_j) / (s_i^2 - s_j^2) b_ij, where b_ij changes by (C_ij s_j^2 + C_ji s_i^2) dt. Plastic flow only reduces the
+        differences tau_i - tau_j. The stiffness of a lone particle does not depend on its state; in bulk the pressure
+        adds to it (`carried_stiffness`): -tau_i = -2 mu e_i - lambda ln J.
         """
         lam, mu, d = max(parameters.lame_lambda, 0.0), parameters.shear_modulus, self.dimension
         largest = max(math.sqrt(bound.stretch_squared_max), STRETCH_MIN)
@@ -121,7 +121,7 @@ class HenckyLaw(Law):
         ]
 
     def stored_energy(self, parameters: HenckyParameters, deformation: np.ndarray) -> np.ndarray:
-        """Return mu |e|^2 + lambda/2 (tr e)^2, before plastic flow takes a part of it."""
+        """Return mu |e|^2 + lambda/2 (tr e)^2, before plastic flow dissipates a part of it."""
         e = np.log(np.maximum(principal(deformation, self.dimension), STRETCH_MIN))
         return parameters.shear_modulus * (e**2).sum(axis=1) + 0.5 * parameters.lame_lambda * e.sum(axis=1) ** 2
 

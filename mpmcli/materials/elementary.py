@@ -1,14 +1,14 @@
-"""Logarithm and exponential from arithmetic alone, which a compiler turns into vector instructions.
+"""Logarithm and exponential from arithmetic alone, which a compiler can vectorise.
 
-A call of the C library keeps a loop over particles from it. Reduction and coefficients are those of FreeBSD's msun
-(Sun Microsystems, 1993), in the two precisions; errors stay below 2 roundings, and devices agree.
+A call of the C library prevents vectorisation of a loop over particles. Reduction and coefficients are those of
+FreeBSD's msun (Sun Microsystems, 1993), in the two precisions; errors stay below 2 roundings, and devices agree.
 """
 
 import math
 
 from mpmcli.quick_taichi import ti
 
-# By precision, single and double. ln 2 in two parts, the first with zeros at its end; the coefficients of log and exp.
+# By precision, single and double: ln 2 in two parts, the first with trailing zeros; the coefficients of log and exp.
 LN2 = (6.9313812256e-01, 9.0580006145e-06), (6.93147180369123816490e-01, 1.90821492927058770002e-10)
 LOG = (
     (0.66666662693, 0.40000972152, 0.28498786688, 0.24279078841),
@@ -72,7 +72,7 @@ def _polynomial(coefficients: ti.template(), x: float):
 
 @ti.func
 def log(x: float):
-    """Return ln x of a normal number; NaN where x is not above 0."""
+    """Return ln x of a normal number; NaN if x is not above 0."""
     k = ti.static(_double())
     bits = _bits(x)
     exponent = (bits - _half_root()) >> FRACTION[k]
@@ -89,7 +89,7 @@ def log(x: float):
 
 @ti.func
 def _reduced(x: float):
-    """Return (2^n, exp(r) - 1) with x = n ln 2 + r; x is cut to where its exponential is normal."""
+    """Return (2^n, exp(r) - 1) with x = n ln 2 + r; x is clamped to the range of normal exponentials."""
     k = ti.static(_double())
     cut = ti.max(ti.min(x, ti.static(RANGE[k][1])), ti.static(RANGE[k][0]))
     n = ti.floor(cut * ti.static(1 / math.log(2)) + 0.5)
@@ -102,13 +102,13 @@ def _reduced(x: float):
 
 @ti.func
 def exp(x: float):
-    """Return e^x, cut to the range of normal numbers."""
+    """Return e^x, clamped to the range of normal numbers."""
     scale, excess = _reduced(x)
     return scale * excess + scale
 
 
 @ti.func
 def exp_minus_1(x: float):
-    """Return e^x - 1, accurate for small x too."""
+    """Return e^x - 1, also accurate for small x."""
     scale, excess = _reduced(x)
     return scale * excess + (scale - 1.0)

@@ -13,7 +13,7 @@ from mpmcli.quick_taichi import ti
 # Places in the vector of constants.
 MU, LAMBDA = range(2)
 
-# Largest entry of F F^T - I for which its series has the digits of single and double precision.
+# Largest entry of F F^T - I for which its series is accurate to single and double precision.
 SMALL = 2e-3, 2e-6
 
 
@@ -27,8 +27,9 @@ class FixedCorotatedParameters(SolidParameters):
 class FixedCorotated(Law):
     """tau = 2 mu (F - R) F^T + lambda (J - 1) J I (Stomakhin et al. 2012; docs/theory.md, 5.4); plane strain in 2D.
 
-    R is the rotation nearest to F. It is defined for inverted states too, which are driven back (`polar_rotation` in
-    2D, `signed_stretches` in 3D). The energy of complete collapse is finite, and the stress vanishes as F approaches 0.
+    R is the rotation nearest to F. It is also defined for inverted states, which the stress drives back
+    (`polar_rotation` in 2D, `signed_stretches` in 3D). The energy of complete collapse is finite, and the stress
+    vanishes as F approaches 0.
     """
 
     name = "fixed_corotated"
@@ -55,7 +56,7 @@ class FixedCorotated(Law):
         return [Mode(2 * parameters.shear_modulus + volumetric)]
 
     def rebound_stretch(self, J: float) -> float:
-        """Return 2 - J, as the energy of volume is that of J - 1."""
+        """Return 2 - J, because the volumetric energy depends on (J - 1)^2."""
         return 2 - J
 
     def stored_energy(self, parameters: FixedCorotatedParameters, deformation: np.ndarray) -> np.ndarray:
@@ -72,11 +73,11 @@ class FixedCorotated(Law):
         pressure_part = constants[LAMBDA] * (J - 1.0) * J
         tau = pressure_part * ti.Matrix.identity(float, F.n)
         if ti.static(F.n == 2):
-            # F^T = S R^T, so that R F^T is symmetric but for rounding.
+            # F^T = S R^T, so that R F^T is symmetric up to rounding.
             stretched = (F - polar_rotation(F)) @ F.transpose()
             tau += constants[MU] * (stretched + stretched.transpose())
         else:
-            # Without the iterations of R, which would keep the compiler from vector instructions.
+            # Without the iterations of R, which would prevent vectorisation.
             Q, s = signed_stretches(F, J)
             # S^2 - S = B/2 + B^2/8 + O(B^3) with B = F F^T - I, whose digits F F^T would lose near rest.
             H = F - ti.Matrix.identity(float, F.n)
@@ -105,7 +106,7 @@ def signed_stretches(F: ti.template(), J: float):
     turned = J < 0.0
     for i in ti.static(range(3)):
         turns = turned and s[i] == smallest
-        # Of equal ones the first.
+        # The first of equal ones.
         turned = turned and not turns
         s[i] = ti.select(turns, -s[i], s[i])
     return Q, s

@@ -16,39 +16,39 @@ from mpmcli.scene.quantity import LARGEST, Flag, NotNegative, Positive
 # Places in the vector of constants.
 BULK_MODULUS, EXPONENT, VISCOSITY, SECOND_VISCOSITY, LARGEST_J, SOUND_SPEED = range(6)
 
-# A particle is relaxed where every node of its stencil is filled beyond this fraction: not at a free surface, where the
-# kernel sees air. The grid sees J up to its inverse.
+# A particle is relaxed if every node of its stencil is filled beyond this fraction, hence not at a free surface, where
+# the kernel includes air. The grid resolves J up to its inverse.
 FULL = 0.2
-# It opens only where the nodes beside the stencil are filled beyond this fraction of the mean over the stencil.
+# It opens only if the nodes beside the stencil are filled beyond this fraction of the mean over the stencil.
 BESIDE = 0.4
-# Difference of the volume ratio that is left alone where there is pressure. The density of particles varies by as much
-# from point to point where they are not on a lattice; relaxed, that noise would make pressure.
+# Difference of the volume ratio that is ignored under pressure. The density of particles that are not on a lattice
+# varies by as much; its relaxation would turn this noise into pressure.
 DEAD_BAND = 0.02
-# Largest lack of volume that makes pressure: particles that lie in one place are no reason for a blow.
+# Largest lack of volume that causes pressure, so that coincident particles do not explode.
 LARGEST_LACK = 0.1
-# Difference that is left alone without pressure, and opening that is forgotten when it ends. A column that is let go
-# opens by a tenth of it at its turning points; closing that without pressure would lengthen its period.
+# Difference that is ignored without pressure, and opening that is forgotten when it ends. A released column opens by a
+# tenth of it at its turning points; closing without pressure would lengthen its period.
 SLACK = 0.005
-# J up to which deformation opens; beyond it only the grid says how far.
+# J up to which deformation opens; beyond it J follows the grid alone.
 OPENED = 2.0
 # Speed that "auto" assumes if nothing in the scene moves or falls, m/s.
 QUIET_SPEED = 1.0
 # The pressure of a nonlinear equation of state is constant below this J, so that J^-g stays within single precision for
 # the largest exponent. The value is far outside weak compressibility; it keeps crushed particles finite.
 CRUSHED = 0.05
-# Suction that a viscous fluid bears where it takes no other tension, in stresses by its own viscosity. The side of a
-# stream that gravity stretches is free of stress only if the fluid pulls inwards as much as it resists: without it the
-# stream widens (docs/theory.md, 5.2). From 1 to 6 it makes no difference.
+# Suction that a viscous fluid without tension bears, in units of its viscous stress. The side of a stream stretched by
+# gravity is free of stress only if the inward suction equals the viscous resistance; without suction the stream widens
+# (docs/theory.md, 5.2). Values from 1 to 6 give the same results.
 SUCTION = 3.0
-# Share of the difference between J and what the grid sees made up while sound crosses a cell: 1 % in ten steps in 2D.
-# Half leaves a broken dam 5 % too shallow; twice gives a floating raft 0.5 % of energy.
+# Fraction of the difference between J and the value on the grid that is removed while sound crosses a cell: 1 % in ten
+# steps in 2D. Half of it leaves a broken dam 5 % too shallow; twice adds 0.5 % of energy to a floating raft.
 RELAXATION = 0.00175
 # Limit on Newton iterations; about six suffice for any load.
 ITERATIONS_MAX = 100
 
 
 def compressibility_of(modulus: str) -> Any:
-    """Return the type of the parameter that settles a modulus which may be "auto"."""
+    """Return the type of the parameter that determines a modulus which may be "auto"."""
     meaning = "0 lets the density vary by 10 %, 1 by 0.01 %, in steps 30 times as many"
     return Annotated[
         float,
@@ -100,7 +100,7 @@ class FluidParameters(WeaklyCompressibleParameters):
 
     @property
     def relaxes(self) -> bool:
-        """Whether J follows the density of the grid: suction holds to the volume as it is."""
+        """Whether J follows the density of the grid; a fluid with suction keeps its volume."""
         return self.tension_cutoff and self.volume_correction
 
     def resolve(self, bounds: SceneBounds) -> tuple[Self, list[str]]:
@@ -127,7 +127,7 @@ class FluidParameters(WeaklyCompressibleParameters):
 def soft_bulk_modulus(density: float, compressibility: float, bounds: SceneBounds) -> tuple[float, str]:
     """Return K = density v^2 / compressibility, Pa, and a sentence that states it; v is the highest speed.
 
-    The density is the largest of what can reach the body: something denser may press on the fluid.
+    The density is the largest of all bodies that can reach the fluid, because a denser one may press on it.
 
     The density of weakly compressible flow varies by v^2/c^2 (Monaghan 1994). A column released without
     compression reaches a pressure of 2 density g H = density v^2, the same bound. In a head-on impact on fluid or a
@@ -145,7 +145,7 @@ def soft_bulk_modulus(density: float, compressibility: float, bounds: SceneBound
 
 @ti.func
 def relaxed_volume(J: float, seen: float, crossings: float, rate: float, opens: float):
-    """Return the volume ratio J after relaxation where the grid sees `seen`, and how much of its change makes pressure.
+    """Return J after relaxation towards `seen`, the value on the grid, and the part of its change that causes pressure.
 
     Above 1, where there is no pressure, J follows at once (docs/theory.md, 5.11); below, by the share `rate` while
     sound crosses a cell. Where `opens` is 0 the volume may not grow.
@@ -154,7 +154,7 @@ def relaxed_volume(J: float, seen: float, crossings: float, rate: float, opens: 
     if J >= 1.0:
         free = ti.max(J + opens * ti.max(seen - J - SLACK, 0.0) + ti.min(seen - J + SLACK, 0.0), 1.0)
     gap = ti.max(seen, ti.min(free, 1.0) - LARGEST_LACK) - free
-    # The density at rest is no room to open into: particles at even spacing may bear pressure.
+    # At the density at rest there is no space to open: evenly spaced particles may bear pressure.
     room = ti.max(ti.min(gap, seen - 1.0) - DEAD_BAND, 0.0)
     change = opens * room + ti.min(gap + DEAD_BAND, 0.0)
     change *= rate * crossings / (1.0 + rate * crossings)
@@ -172,12 +172,12 @@ def shear_rate(C: ti.template()):
 
 @ti.func
 def opened_volume(J_minus_1: float, growth: float):
-    """Return J - 1 after J grew by the factor 1 + growth, for material that remembers how far it opened."""
+    """Return J - 1 after J grew by the factor 1 + growth, for material that stores its opening."""
     opened = J_minus_1 + (growth + growth * J_minus_1)
-    # Comparisons, which NaN does not meet: a lost particle stays not finite.
+    # Comparisons with NaN are false, so that a lost particle stays not finite.
     if opened > OPENED - 1.0 and opened > J_minus_1:
         opened = ti.max(J_minus_1, OPENED - 1.0)
-    # Closing after so little begins at J = 1.
+    # After such a small opening, closing begins at J = 1.
     if growth < 0.0 and J_minus_1 > 0.0 and J_minus_1 < SLACK:
         opened = growth
     return opened
@@ -187,9 +187,9 @@ def opened_volume(J_minus_1: float, growth: float):
 class Fluid(Law):
     """p = K/g (J^-g - 1) and tau = -J p I + viscosity (C + C^T - (2/3) tr C I) + bulk_viscosity tr C I.
 
-    With tension_cutoff fluid that expands in a splash, J > 1, has no pressure. With volume_correction J stays there and
-    follows the density of the grid, and p >= -3 viscosity sqrt(2 D':D'), D' the deviator of the rate of strain in 3D;
-    without it J falls back to 1. Source: docs/theory.md, 5.2 and 5.11.
+    With tension_cutoff, fluid that expands in a splash, J > 1, has no pressure. With volume_correction J stays there
+    and follows the density of the grid, and p >= -3 viscosity sqrt(2 D':D'), D' the deviator of the rate of strain in
+    3D; without it J falls back to 1. Source: docs/theory.md, 5.2 and 5.11.
     """
 
     name = "fluid"
@@ -226,7 +226,7 @@ class Fluid(Law):
         """Return d K ((g - 1) J^(1-g) + J) / g for volume, with viscosity (2 - 2d/3) mu + d zeta, and 2 mu for shear.
 
         -J p changes by that K-term times tr(C) dt, and tr(C) is a sum of d entries. The term is convex in J,
-        therefore largest at an end of its range. Strongly compressed fluid in bulk is stiffer: K J^(1-g), see CARRIED.
+        therefore largest at an end of its range. Strongly compressed bulk fluid is stiffer: K J^(1-g), see CARRIED.
         """
         d, g, K = self.dimension, parameters.exponent, parameters.bulk_modulus
         largest = min(bound.volume_ratio_max, 1.0 if parameters.tension_cutoff else LARGEST)
@@ -238,7 +238,7 @@ class Fluid(Law):
         return modes + [Mode(0.0, 2 * parameters.viscosity)] * (parameters.viscosity > 0)
 
     def rebound_bound(self, bound: StateBound) -> StateBound:
-        """Return the bound with what tension pulls back: J = 1.1 to about 1 / 1.1."""
+        """Return the bound with the rebound from tension: J = 1.1 to about 1 / 1.1."""
         if self.cut or not bound.volume_ratio_max > 1:
             return super().rebound_bound(bound)
         smallest = min(bound.volume_ratio_min, 1 / bound.volume_ratio_max)
@@ -276,7 +276,7 @@ class Fluid(Law):
             crushed = J
             if J < CRUSHED:
                 crushed = CRUSHED
-            # 1 - J^-g, as the exponential of a small number.
+            # 1 - J^-g, by the exponential of a small number.
             excess = -exp_minus_1(-constants[EXPONENT] * log(crushed))
             spherical = constants[BULK_MODULUS] * crushed * excess / constants[EXPONENT]
         if ti.static(self.relaxes):
@@ -314,7 +314,7 @@ class Fluid(Law):
         time: float,
         constants: ti.template(),
     ):
-        """Move J towards what the grid sees."""
+        """Move J towards the value on the grid."""
         J, pressed = relaxed_volume(deformation, seen, constants[SOUND_SPEED] * time, RELAXATION, opens)
         return J, internal, pressed / J
 
@@ -331,7 +331,7 @@ class Fluid(Law):
             if g > 1.0:
                 if J < CRUSHED:
                     J = CRUSHED
-                # J^(1-g) - 1, as the exponential of a small number.
+                # J^(1-g) - 1, by the exponential of a small number.
                 power = exp_minus_1((1.0 - g) * log(J))
                 result = (J - 1.0 + power / (g - 1.0)) / g
         return constants[BULK_MODULUS] * result
@@ -339,7 +339,7 @@ class Fluid(Law):
 
 @ti.func
 def volume_energy(J: float):
-    """Return J - 1 - ln J, without its cancellation near 1: with y = x/(2 + x), ln(1 + x) = 2 (y + y^3/3 + ...)."""
+    """Return J - 1 - ln J without cancellation near 1: with y = x/(2 + x), ln(1 + x) = 2 (y + y^3/3 + ...)."""
     x = J - 1.0
     result = x - log(ti.max(J, 1e-9))
     if ti.abs(x) < 0.05:

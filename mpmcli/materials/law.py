@@ -12,10 +12,10 @@ from mpmcli.quick_taichi import ti
 from mpmcli.scene.material import Internal, MaterialParameters, SceneBounds
 from mpmcli.scene.schema import NEARLY_INCOMPRESSIBLE
 
-# In bulk the pressure itself adds stiffness, because particles carry it with them: pressure waves see the sum of the
-# tangent modulus and the pressure (docs/theory.md, 6.6). For a fluid of p = K (1/J - 1) that is K at any J. At J = 0.5
-# and 0.3, where the sum exceeds the tangent modulus of a lone particle, one particle per cell at a random position
-# becomes unstable at 0.956 and 0.969 of h/c, c = sqrt(K / density). The factor covers that.
+# In bulk the pressure itself adds stiffness, because particles carry it with them: the stiffness of pressure waves is
+# the sum of the tangent modulus and the pressure (docs/theory.md, 6.6). For a fluid of p = K (1/J - 1) that is K at any
+# J. At J = 0.5 and 0.3, where the sum exceeds the tangent modulus of a lone particle, one particle per cell at a random
+# position becomes unstable at 0.956 and 0.969 of h/c, c = sqrt(K / density). The factor covers that.
 CARRIED = 1.2
 # Lower bound on J and on stretches, which keeps their logarithms finite.
 SMALLEST = 1e-6
@@ -55,7 +55,7 @@ def principal(deformation: np.ndarray, dimension: int) -> np.ndarray:
 
 
 def carried_stiffness(tangent: float, pressure: float) -> float:
-    """Return the stiffness that a wave in compressed bulk sees, Pa: tangent modulus and pressure (docs/theory.md, 6.6).
+    """Return the stiffness of a wave in compressed bulk, Pa: tangent modulus plus pressure (docs/theory.md, 6.6).
 
     The tangent modulus is that of a plane wave, d tau / d strain along its direction; the pressure the largest -tau_i.
     """
@@ -77,14 +77,14 @@ class Law(ABC):
         parameters: pydantic model of the parameters, which also lists the internal variables.
         deformation: stored deformation, "J" (volume ratio) or "F" (deformation gradient).
         projects: whether `respond` may change the state.
-        relaxes: whether `relax` moves the volume towards what the grid sees (docs/theory.md, 5.11).
+        relaxes: whether `relax` moves the volume towards its value on the grid (docs/theory.md, 5.11).
         grows_by_constants: whether `grown` reads the constants.
         stiffness_parameters, viscosity_parameters: names of the parameters that set the stiffness and the viscosity;
-            messages name the first that is a positive number. A law that calls them otherwise lists its own.
+            messages name the first that is a positive number. A law with other names lists its own.
         coherent: whether the material resists being pulled apart, so that `check` reports a J far above 1.
         locks: whether a body has a Poisson's ratio at which its changes of volume are averaged over cells by default
             (docs/theory.md, 4.4).
-        flows: whether it is a liquid or grains, whose volume the ledger compares with what they fill on the grid.
+        flows: whether it is a liquid or grains, whose volume the ledger compares with the volume filled on the grid.
         shifts: whether particles are shifted out of crowds (docs/theory.md, 5.12).
         elastic: whether the stress is a function of F alone, so that the body can be computed on the grid of its state
             at rest (docs/theory.md, 2.6).
@@ -112,7 +112,7 @@ class Law(ABC):
     hardening: float = 0.0
 
     def __init_subclass__(cls, **options: object) -> None:
-        """Copy what scenes are checked for to the parameter class: there is no instance of the law yet."""
+        """Copy the attributes for scene checks to the parameter class, because no instance of the law exists yet."""
         super().__init_subclass__(**options)
         parameters = getattr(cls, "parameters", None)
         if isinstance(parameters, type) and issubclass(parameters, MaterialParameters):
@@ -128,7 +128,7 @@ class Law(ABC):
 
     @property
     def terms(self) -> tuple[tuple[str, bool], ...]:
-        """Name and value of each flag that says which terms the law has: laws with equal ones compile to one kernel."""
+        """Name and value of each flag that selects terms of the law; laws with equal flags share one kernel."""
         return tuple(sorted((name, value) for name, value in vars(self).items() if isinstance(value, bool)))
 
     @abstractmethod
@@ -156,10 +156,10 @@ class Law(ABC):
         raise NotImplementedError
 
     def rebound_bound(self, bound: StateBound) -> StateBound:
-        """Return the bound that contains what springs back as well.
+        """Return the bound that also contains rebounding states.
 
-        A particle alone that is compressed to J and let go opens to `rebound_stretch` and oscillates between the two
-        for ever: its step must suit both (docs/theory.md, 6.8).
+        A lone particle that is compressed to J and released opens to `rebound_stretch` and oscillates between the two
+        for ever; the step must be stable for both (docs/theory.md, 6.8).
         """
         if not 0 < bound.volume_ratio_min < 1:
             return bound
@@ -171,11 +171,11 @@ class Law(ABC):
         )
 
     def rebound_stretch(self, J: float) -> float:
-        """Return the J > 1 of about the energy of a volume ratio J, 0 < J < 1: 1 / J where energy is that of ln J."""
+        """Return the J > 1 with about the energy of a volume ratio J, 0 < J < 1: 1 / J for an energy of ln J."""
         return 1 / J
 
     def stored_energy(self, parameters: MaterialParameters, deformation: np.ndarray) -> np.ndarray:
-        """Return a bound on the energy that states hold at the start, (n,), J/m^3 of volume at rest, on the host.
+        """Return a bound on the stored energy of initial states, (n,), J/m^3 of volume at rest, on the host.
 
         It is S |e|^2 / 2 with the largest stiffness S between rest and the state, and e the logarithms of its
         stretches; the deformation is J, (n,), or F, (n, d, d), finite. A law whose energy has a short formula overrides
@@ -226,7 +226,7 @@ class Law(ABC):
         """Return J - 1 after J grew by the factor 1 + growth in a step, for laws that keep J.
 
         Args:
-            constants: as of `respond` where `grows_by_constants`, else a single unused 0.
+            constants: as for `respond` if `grows_by_constants`, else a single unused 0.
         """
         return J_minus_1 + (growth + growth * J_minus_1)
 
@@ -240,17 +240,16 @@ class Law(ABC):
         time: float,
         constants: ti.template(),
     ):
-        """Return (deformation, internal, change), moved towards what the grid sees; momentum and mass stay.
+        """Return (deformation, internal, change), moved towards the volume on the grid, at equal momentum and mass.
 
-        The change is that of the logarithm of the volume, without sign, as far as it changes the stiffness. Only laws
-        with `relaxes` have it.
+        The change is the absolute change of the logarithm of the volume, as far as it affects the stiffness. Only laws
+        with `relaxes` have this method.
 
         Args:
-            deformation, internal, constants: as of `respond`.
-            seen: volume ratio that the density of the grid around the particle amounts to.
-            opens: 1 where the volume may grow: 0 near a free surface, where the grid sees less than what is there.
-            time: since the last relaxation over the cell's width, s/m: times the speed of sound it counts the cells
-                that sound crossed.
+            deformation, internal, constants: as for `respond`.
+            seen: volume ratio from the density of the grid around the particle. opens: 1 if the volume may grow; 0 near
+                a free surface, where the density of the grid is too small. time: time since the last relaxation over
+                the cell's width, s/m; times the speed of sound it is the number of cells that sound has crossed.
         """
         raise NotImplementedError
 

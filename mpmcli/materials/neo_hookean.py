@@ -38,13 +38,13 @@ class NeoHookean(Law):
         return (parameters.shear_modulus, parameters.lame_lambda)
 
     def modes(self, parameters: NeoHookeanParameters, bound: StateBound) -> list[Mode]:
-        """Return d lambda + 2 mu s^2, where s is the largest stretch, and what bulk under pressure adds.
+        """Return d lambda + 2 mu s^2, where s is the largest stretch, and the addition for bulk under pressure.
 
-        Under C dt, tau changes by mu (C b + b C^T) dt + lambda tr(C) dt I. In the principal frame of
-        b = F F^T the normal entries see the matrix 2 mu diag(s_i^2) + lambda (1 1^T), the pairs of
-        shear entries mu (s_i^2 + s_j^2): no eigenvalue exceeds the sum above, which is exact at rest.
-        Compression adds none to a particle alone, as lambda ln(J) I changes by lambda tr(C) dt at any J. In bulk
-        waves see the pressure too (`carried_stiffness`): -tau_i = mu (1 - s_i^2) - lambda ln J.
+        Under C dt, tau changes by mu (C b + b C^T) dt + lambda tr(C) dt I. In the principal frame of b = F F^T the
+        normal entries see the matrix 2 mu diag(s_i^2) + lambda (1 1^T), the pairs of shear entries mu (s_i^2 + s_j^2):
+        no eigenvalue exceeds the sum above, which is exact at rest. Compression does not stiffen a lone particle,
+        because lambda ln(J) I changes by lambda tr(C) dt at any J. In bulk the pressure adds to the stiffness
+        (`carried_stiffness`): -tau_i = mu (1 - s_i^2) - lambda ln J.
         """
         lam, mu = max(parameters.lame_lambda, 0.0), parameters.shear_modulus
         shear = 2 * mu * bound.stretch_squared_max

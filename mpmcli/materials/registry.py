@@ -30,7 +30,7 @@ def parameter_models() -> tuple[type[MaterialParameters], ...]:
 
 
 def load_plugins(paths: Sequence[Path]) -> tuple[type[MaterialParameters], ...]:
-    """Replace all loaded plugins by these, and return the parameter models of all laws.
+    """Replace all loaded plugins by the given ones, and return the parameter models of all laws.
 
     Each is a Python file that is run and defines `LAW`. InputError: there is no such file, it fails, its LAW is
     incomplete, or the name of the law is taken.
@@ -70,13 +70,13 @@ def _own_laws() -> dict[str, type[Law]]:
 
 
 def _run(path: Path) -> ModuleType:
-    """Execute a file and return it as a module, without writing a cache beside it."""
+    """Execute a file and return it as a module, without writing a cache file."""
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
         raise InputError(f"{path}: there is no such file; give a Python file that defines LAW") from None
     except (OSError, UnicodeDecodeError) as error:
-        said = error.strerror if isinstance(error, OSError) else "it is no text in UTF-8"
+        said = error.strerror if isinstance(error, OSError) else "it is not text in UTF-8"
         raise InputError(f"{path}: the file cannot be read: {said}") from None
     # The full path: Taichi reads the source of kernels from it later, possibly from another working directory.
     file = str(path.resolve())

@@ -31,10 +31,10 @@ MU, LAMBDA, TIP, SLOPE, CORRECTION, SOUND_SPEED = range(6)
 REAL_MODULUS = 5e7
 # Upper bound on the plastic volume strain, ln J. It caps dilation, so that loose grains can recompact.
 SCATTERED = 2.0
-# Difference from the volume strain that the grid sees that is left alone: the density varies by as much between grains.
+# Difference from the volume strain on the grid that is ignored, because the density varies by as much between grains.
 BAND = 0.025
-# Share of the rest by which pressed sand opens while sound crosses a cell. With a tenth, as of fluids, sand that was
-# scattered stays up to 3 % too voluminous.
+# Fraction of the rest by which sand under pressure opens while sound crosses a cell. With a tenth, as for fluids,
+# scattered sand stays up to 3 % too voluminous.
 RELAXATION = 0.0175
 # Above this angle, degrees, the cone in 3D admits a tensile principal stress.
 STEEPEST_3D = 60.0
@@ -89,12 +89,12 @@ class SandParameters(HenckyParameters):
     @model_validator(mode="before")
     @classmethod
     def _of_the_heap(cls, said: Any, info: ValidationInfo) -> Any:
-        """Set the friction angle by that of a heap, sin(phi) = tan(repose) (Davis 1968; docs/theory.md, 5.7)."""
+        """Set the friction angle from the slope of a heap, sin(phi) = tan(repose) (Davis 1968; docs/theory.md, 5.7)."""
         slope = said.get("repose_angle") if isinstance(said, Mapping) else None
         if slope is None:
             return said
         if not (isinstance(slope, int | float) and 0 < slope < 45):
-            # The field says what is wrong with it.
+            # The field itself reports its fault.
             return {"friction_angle": 30.0, **said}
         angle = math.degrees(math.asin(math.tan(math.radians(slope))))
         given = said.get("friction_angle", angle)
@@ -213,7 +213,7 @@ class Sand(HenckyLaw):
         time: float,
         constants: ti.template(),
     ):
-        """Move v towards what the grid sees, by the change of J = det F exp v. A lack of volume, v < 0, is left."""
+        """Move v towards the value on the grid, by the change of J = det F exp v. A lack, v < 0, is ignored."""
         v = internal
         if constants[CORRECTION] > 0.0:
             J = deformation.determinant()
@@ -225,7 +225,7 @@ class Sand(HenckyLaw):
             opening = ti.max(ti.min(strain - volume, strain) - BAND, 0.0)
             closing = ti.min(strain - volume + BAND, 0.0)
             v[0] = ti.min(ti.max(v[0] + opens * share * opening + closing, 0.0), SCATTERED)
-        # Less pressure is no stiffer.
+        # A lower pressure does not increase the stiffness.
         return deformation, v, 0.0
 
     @ti.func

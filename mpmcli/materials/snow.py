@@ -130,7 +130,8 @@ class Snow(Law):
 
         By the balance of momentum, the stress behind a wave that stops the speed v and compacts by the strain e is
         density (v^2/e + g H). It compacts to the strain e for which h(e) times the yield stress in confined compression
-        equals it. The density is the largest of what can reach the snow: something denser may fall on it.
+        equals it. The density is the largest of all bodies that can reach the snow, because a denser one may fall on
+        it.
         """
         low, high = 1 - parameters.critical_compression, 1 + parameters.critical_stretch
         modulus = 2 * parameters.shear_modulus + parameters.lame_lambda

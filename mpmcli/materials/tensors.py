@@ -269,7 +269,7 @@ def _stretches_3d(F: ti.template()):
 
 def determinant(F: np.ndarray) -> np.ndarray:
     """Return det F, (n,), of 2 x 2 or 3 x 3 matrices, (n, d, d), written out: ten times as fast as a factorisation."""
-    # A run that became unstable may hold any number, and is still examined.
+    # An unstable run, which is still examined, may contain any number.
     with np.errstate(over="ignore", invalid="ignore"):
         if F.shape[-1] == 2:
             return F[:, 0, 0] * F[:, 1, 1] - F[:, 0, 1] * F[:, 1, 0]
@@ -292,7 +292,7 @@ def volume_strain(H: ti.template()):
 
 @ti.func
 def log_ratio(x: float):
-    """Return ln(1 + x), accurate for small x too (Kahan's correction of the rounding in 1 + x)."""
+    """Return ln(1 + x), also accurate for small x (Kahan's correction of the rounding in 1 + x)."""
     ratio = 1.0 + x
     rounded = ratio - 1.0
     result = x

@@ -77,7 +77,7 @@ class Viscoplastic(Law):
 
     With tension_cutoff the stored J is at most 1, as in the fluid, and the shear stress falls by J^(-1/TEAR_STRAIN):
     material that has dilated by a tenth is torn, while small oscillations of material at rest change little. In 2D
-    dev is taken in the plane, without an out-of-plane deviator. Inverted and flat particles lose their shape.
+    dev is taken in the plane, without an out-of-plane deviator. The shape of inverted and flat particles is reset.
     """
 
     name = "viscoplastic"
@@ -105,10 +105,9 @@ class Viscoplastic(Law):
     def modes(self, parameters: ViscoplasticParameters, bound: StateBound) -> list[Mode]:
         """Return d K J for volume, and 2 G b_max for shear, with b_max the largest eigenvalue of the isochoric b.
 
-        The two do not couple: C = c I does not change the isochoric b, and the rest of C changes dev b only, by
-        G (b_i + b_j) at most for a pair of shear entries and by diag(2 G b_i) without its trace for the normal ones.
-        Relaxation reduces the result for any step. Strongly compressed matter in bulk is stiffer: K, see
-        `law.CARRIED`.
+        The two do not couple: C = c I does not change the isochoric b, and the rest of C changes dev b only, by G (b_i
+        + b_j) at most for a pair of shear entries and by diag(2 G b_i) without its trace for the normal ones.
+        Relaxation reduces the result for any step. Strongly compressed bulk matter is stiffer: K, see `law.CARRIED`.
         """
         largest = min(bound.volume_ratio_max, 1.0) if parameters.tension_cutoff else bound.volume_ratio_max
         smallest = max(bound.volume_ratio_min, CRUSHED)
@@ -215,8 +214,8 @@ def isochoric_mean(dev: ti.template(), above: float):
     m = ti.sqrt(1.0 + square)
     if ti.static(dev.n == 3):
         # m^3 - square m + det dev = 1, convex above the root: Newton's method decreases to it. As det dev is at least
-        # -2 (square/3)^(3/2), the root is at most 2 (square/3)^(1/2) + 1. A loop that ended when it has converged would
-        # keep the compiler from vector instructions; it has, after so many, where particles are not flat.
+        # -2 (square/3)^(3/2), the root is at most 2 (square/3)^(1/2) + 1. A loop with a convergence test would prevent
+        # vectorisation; this number suffices for particles that are not flat.
         m = ti.min(above, 2.0 * ti.sqrt(square * ti.static(1 / 3)) + 1.0)
         constant = dev.determinant() - 1.0
         for _ in ti.static(range(12 if rounding() > 1e-10 else 15)):

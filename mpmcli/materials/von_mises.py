@@ -34,10 +34,10 @@ class VonMisesParameters(HenckyParameters):
     yield_stress: Annotated[
         Positive,
         Knob("strength", 1e3, 1e9, "0 is soft putty, 0.3 clay, 0.75 soft aluminium, 0.9 mild steel, 1 tool steel"),
-    ] = Field(description="Stress at which a bar that is pulled begins to flow, Pa; clay 1e4 to 1e5, metal 1e7 to 1e9.")
-    hardening_modulus: Annotated[
-        NotNegative, Knob("hardness", 1e3, 1e9, "0 goes on as soft as it begins, 1 hardens like steel")
-    ] = Field(0.0, description="Growth of the yield stress per plastic strain, Pa; 0 is perfectly plastic.")
+    ] = Field(description="Yield stress in uniaxial tension, Pa; clay 1e4 to 1e5, metal 1e7 to 1e9.")
+    hardening_modulus: Annotated[NotNegative, Knob("hardness", 1e3, 1e9, "0 does not harden, 1 hardens like steel")] = (
+        Field(0.0, description="Growth of the yield stress per plastic strain, Pa; 0 is perfectly plastic.")
+    )
 
     internal: ClassVar[tuple[Internal, ...]] = (
         Internal("plastic_strain", 0.0, "Equivalent plastic strain, dimensionless."),
@@ -82,7 +82,7 @@ class VonMises(HenckyLaw):
 
     @ti.func
     def strains(self, s: ti.template(), internal: ti.template()):
-        """Return the three principal Hencky strains, that out of the plane last in 2D."""
+        """Return the three principal Hencky strains, in 2D with the out-of-plane strain last."""
         in_frame = hencky_strains(s)
         e = ti.Vector([in_frame[0], in_frame[1], 0.0])
         if ti.static(self.dimension == 2):

@@ -1,4 +1,4 @@
-"""Frames on disk: the stores that write them, the results that read them, the record of a run."""
+"""Frames on disk: stores that write them, results that read them, and the record of a run."""
 
 from mpmcli.output.directory import check_directory
 from mpmcli.output.result import Result, open_result

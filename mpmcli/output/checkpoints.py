@@ -1,4 +1,4 @@
-"""Checkpoints: complete states of a run that goes on, from which it can be resumed. The two newest ones are kept."""
+"""Checkpoints: complete states of a running simulation, from which it can be resumed. The newest two are kept."""
 
 import io
 import json
@@ -24,13 +24,13 @@ FORMAT = 1
 KEPT = 2
 # Member with the facts, as JSON.
 FACTS = "facts"
-# What a damaged archive raises.
+# Exceptions that a damaged archive raises.
 ARCHIVE_DAMAGE = (*DAMAGE, EOFError, struct.error, zipfile.BadZipFile, zlib.error)
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A run at rest: `frame` is the first not stored, `forced` time.step as it was, `arrays` are taken one by one."""
+    """The state of a run: `frame` is the first not stored, `forced` as in the run, `arrays` are read one by one."""
 
     frame: int
     step: int
@@ -81,7 +81,7 @@ def _paths(directory: Path) -> list[Path]:
 
 def _read(path: Path) -> Checkpoint:
     with zipfile.ZipFile(path) as file:
-        # Each member has a CRC-32, which is compared when all of it is read, before anything is made of it.
+        # Each member has a CRC-32, which is compared when all of it has been read, before it is used.
         members = {name.removesuffix(".npy"): io.BytesIO(file.read(name)) for name in file.namelist()}
     arrays = {name: np.load(data, allow_pickle=False) for name, data in members.items()}
     facts = json.loads(arrays.pop(FACTS).tobytes().decode("utf-8"))

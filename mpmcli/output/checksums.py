@@ -1,13 +1,13 @@
-"""Checksums of what was written: of the parts of an HDF5 file, of a whole one, and of the files of a directory.
+"""Checksums of written data: of the parts of an HDF5 file, of a whole file, and of the files of a directory.
 
 A group of an HDF5 file has a data set `checksums`, (T, A) uint32: the CRC-32 of the rows of frame t in array a. Its
 attribute `list`, JSON, names the A arrays, and gives the CRC-32 of every other data set and attribute; its attribute
-`checksum` is the CRC-32 of that text and of the table. The last bytes of the file, which no reader of HDF5 reads, are a
-CRC-32 of all bytes before them but those of the A arrays, so that large files are read once.
+`checksum` is the CRC-32 of that text and of the table. The last bytes of the file, which readers of HDF5 ignore, are a
+CRC-32 of all bytes before them except those of the A arrays, so that large files are read only once.
 
 A directory has a file checksums.sha256, as `sha256sum -c` reads it.
 
-What readers raise on a damaged or foreign file of HDF5 becomes one sentence.
+Exceptions of readers at a damaged or foreign HDF5 file become one sentence.
 """
 
 import json
@@ -26,16 +26,16 @@ from pydantic import ValidationError
 
 from mpmcli.errors import InputError
 
-# Of h5py, numpy, JSON, TOML and pydantic, where content contradicts itself. InputError: a reader said what is wrong.
+# Exceptions of h5py, numpy, JSON, TOML and pydantic at inconsistent content. InputError: a reader has named the fault.
 DAMAGE = (InputError, OSError, RuntimeError, ValueError, LookupError, TypeError, AttributeError, MemoryError)
 
 
 class DamageError(InputError):
-    """A file that was written by mpmcli, and has changed since."""
+    """A file written by mpmcli has changed since."""
 
 
 def first_line(error: Exception) -> str:
-    """Return the first line of what an exception says, without a period at its end, or its type."""
+    """Return the first line of an exception's message, without a period at its end, or its type."""
     if isinstance(error, ValidationError):
         first = error.errors()[0]
         return f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
@@ -43,7 +43,7 @@ def first_line(error: Exception) -> str:
 
 
 def open_hdf5(path: Path, wanted: str) -> h5py.File:
-    """Open a sealed file for reading, without a lock; InputError: it is no HDF5 file; `wanted` is what to give."""
+    """Open a sealed file for reading, without a lock; InputError: it is no HDF5 file; `wanted` names the right one."""
     try:
         try:
             return h5py.File(path, "r", locking=False)
@@ -59,7 +59,7 @@ def open_hdf5(path: Path, wanted: str) -> h5py.File:
 
 @contextmanager
 def opened(path: Path, wanted: str) -> Iterator[h5py.File]:
-    """Open a file as `open_hdf5` does; what reading it raises becomes a DamageError."""
+    """Open a file as `open_hdf5` does; errors while reading it become a DamageError."""
     with open_hdf5(path, wanted) as file:
         try:
             yield file
@@ -67,11 +67,11 @@ def opened(path: Path, wanted: str) -> Iterator[h5py.File]:
             raise
         except DAMAGE as error:
             what = first_line(error)
-            raise DamageError(f"{path} is damaged: what it should hold cannot be read ({what}).") from error
+            raise DamageError(f"{path} is damaged: its content cannot be read ({what}).") from error
 
 
 def require_format(path: Path, found: object, ours: int) -> None:
-    """Refuse with an InputError a file of another format than `ours`."""
+    """Raise an InputError for a file of a format other than `ours`."""
     if found != ours:
         raise InputError(
             f"{path} has format {found}, and this version of mpmcli reads format {ours}: use the version that wrote it."
@@ -83,13 +83,13 @@ _LIST, _OWN = "list", "checksum"
 _FILE_END = "\nmpmcli crc32 {:08x}\n"
 _BLOCK = 2**22
 SUMS = "checksums.sha256"
-# Names of our own files are plain.
+# Files written by mpmcli have plain names.
 _SUMS_LINE = re.compile(r"([0-9a-f]{64})  (\w[\w.-]*)\n")
 Gap = tuple[int, int]
 
 
 def checksum(array: np.ndarray, before: int = 0) -> int:
-    """Return the CRC-32 of the bytes of an array, after those whose CRC-32 is `before`."""
+    """Return the CRC-32 of the bytes of an array, continued from the CRC-32 `before`."""
     return zlib.crc32(np.ascontiguousarray(array).reshape(-1).view(np.uint8), before)
 
 
@@ -104,14 +104,14 @@ def table_checksum(array: np.ndarray) -> int:
 
 
 def attribute_checksum(value: Any) -> int:
-    """Return the checksum of an attribute as h5py gives it."""
+    """Return the checksum of an attribute as h5py returns it."""
     if isinstance(value, str):
         return zlib.crc32(value.encode("utf-8", "surrogateescape"))
     return table_checksum(np.asarray(value))
 
 
 def item_checksums(root: h5py.Group, arrays: Collection[str], own: str) -> dict[str, int]:
-    """Return the checksums of all below a group but those at `own`; of `arrays`, which have frames, type and shape."""
+    """Return the checksums of all items below a group except `own`; of `arrays`, which have frames, type and shape."""
     sums = {}
 
     def note(path: str, item: h5py.Group | h5py.Dataset) -> None:
@@ -128,23 +128,23 @@ def item_checksums(root: h5py.Group, arrays: Collection[str], own: str) -> dict[
 
 
 def damaged(path: str, what: str) -> DamageError:
-    """Return the error of something that has changed since it was written."""
+    """Return the error for an item that has changed since it was written."""
     return DamageError(f"{path} is damaged: {what} does not have the checksum that it was written with.")
 
 
 class FrameChecksums:
-    """The checksums of arrays with frames, whose rows are given a part after another: a table, (T, A) uint32."""
+    """The checksums of arrays with frames, computed from consecutive parts of their rows: a table, (T, A) uint32."""
 
     def __init__(self, names: Collection[str], counts: Sequence[int]) -> None:
         """Begin with the first row of A arrays; `counts` of rows of each of the T frames."""
         self.table = np.zeros((len(counts), len(names)), np.uint32)
         self._ends = np.cumsum(np.asarray(counts, np.int64)).tolist()
         self._columns = {name: column for column, name in enumerate(names)}
-        # Of each array: the frame of the next row, and the number of that row.
+        # For each array: the frame of the next row, and the number of that row.
         self._places = dict.fromkeys(names, (0, 0))
 
     def add(self, name: str, rows: np.ndarray) -> None:
-        """Add the next rows of an array, of parts of a frame or of several."""
+        """Add the next rows of an array: part of a frame, or several frames."""
         column, (k, row) = self._columns[name], self._places[name]
         while len(rows):
             while self._ends[k] == row:
@@ -169,17 +169,17 @@ class Checksums:
     items: dict[str, int]
 
     def require(self, key: str, found: int) -> None:
-        """Compare the checksum of an item, which must be known."""
+        """Compare the checksum of an item; DamageError: it differs or is unknown."""
         if self.items.get(key) != found:
             raise damaged(self.file, _item_name(key))
 
     def differences(self, found: Mapping[str, int]) -> list[DamageError]:
-        """Return an error for each item (`item_checksums`) that differs, is missing, or is not known."""
+        """Return an error for each item (`item_checksums`) that differs, is missing, or is unknown."""
         keys = sorted(found.keys() | self.items.keys())
         return [damaged(self.file, _item_name(key)) for key in keys if found.get(key) != self.items.get(key)]
 
     def require_frame(self, t: int, path: str, rows: np.ndarray, number: int) -> None:
-        """Compare the checksum of the rows of the t-th frame of the file, which has a `number` in its run."""
+        """Compare the checksum of the rows of the t-th frame of the file, which is frame `number` of the run."""
         if path not in self.arrays or t >= len(self.table) or checksum(rows) != self.table[t, self.arrays.index(path)]:
             raise damaged(self.file, f"the data set {path} of frame {number}")
 
@@ -187,9 +187,9 @@ class Checksums:
 def store_checksums(
     root: h5py.Group, place: str, arrays: Sequence[str], table: np.ndarray, known: Mapping[str, int] | None = None
 ) -> None:
-    """Write the checksums of all below a group at `place` in it, once all of it has been written.
+    """Write the checksums of all items below a complete group, at `place` in it.
 
-    `arrays` have the frames' checksums (T, A) uint32; `known` are `item_checksums`, None to read all items again.
+    `table`, (T, A) uint32, has those of the frames of `arrays`; `known` are `item_checksums`, None to read all again.
     """
     path = f"{place}/{NAME}" if place else NAME
     sums = item_checksums(root, arrays, path) if known is None else known
@@ -211,7 +211,7 @@ def load_checksums(root: h5py.Group, place: str) -> Checksums:
 
 
 def _item_name(key: str) -> str:
-    """Return what a key of `Checksums.items` means, in words."""
+    """Return a key of `Checksums.items` in words."""
     path, at, name = key.rpartition("@")
     if not at:
         return f"the data set {key}"
@@ -219,13 +219,13 @@ def _item_name(key: str) -> str:
 
 
 def gaps_of(arrays: Sequence[h5py.Dataset]) -> list[Gap]:
-    """Return offset and length of the contiguous arrays in their file; compressed ones have none."""
+    """Return offset and length of each contiguous array in its file; compressed arrays are left out."""
     places = [(data.id.get_offset(), data.id.get_storage_size()) for data in arrays if data.chunks is None]
     return sorted((offset, length) for offset, length in places if offset is not None and length)
 
 
 def append_checksum(path: Path, gaps: Sequence[Gap] = ()) -> None:
-    """Append the checksum to a closed file, of all its bytes but those in `gaps`, ascending."""
+    """Append to a closed file the checksum of all its bytes except those in `gaps`, ascending."""
     with path.open("r+b") as file:
         size = file.seek(0, 2)
         end = _file_end(file, size, gaps)
@@ -234,7 +234,7 @@ def append_checksum(path: Path, gaps: Sequence[Gap] = ()) -> None:
 
 
 def checksum_is_right(path: Path, gaps: Sequence[Gap] = ()) -> bool:
-    """Return whether the last bytes of a file are the checksum of those before."""
+    """Return whether the last bytes of a file are the checksum of the bytes before."""
     with path.open("rb") as file:
         size = file.seek(0, 2) - len(_FILE_END.format(0))
         if size < 0:
@@ -244,7 +244,7 @@ def checksum_is_right(path: Path, gaps: Sequence[Gap] = ()) -> bool:
 
 
 def _file_end(file: BinaryIO, size: int, gaps: Sequence[Gap]) -> bytes:
-    """Return what ends a file that has `size` bytes before."""
+    """Return the last bytes of a file, after its first `size` bytes."""
     total = 0
     starts, ends = [offset for offset, _ in gaps], [offset + length for offset, length in gaps]
     for first, end in zip([0, *ends], [*(min(start, size) for start in starts), size], strict=True):

@@ -1,7 +1,7 @@
-"""The surfaces of colliders beside the particles, for ParaView: those at rest once, those that move at every frame.
+"""Writes surfaces of colliders for ParaView: colliders at rest once, moving ones at every frame.
 
-VTKHDF PolyData as of the particles (see `vtkhdf`), of triangles in 3D and lines in 2D. All frames share one list of
-cells, and those of colliders at rest one set of points.
+The files are VTKHDF PolyData, as for particles (see `vtkhdf`), with triangles in 3D and lines in 2D. All frames share
+one list of cells; colliders at rest also share one set of points.
 """
 
 import json
@@ -35,7 +35,7 @@ CELLS = ("Vertices", "Lines", "Polygons", "Strips")
 
 @dataclass(frozen=True, eq=False)
 class ColliderGroup:
-    """The colliders of a run that move, or those that do not: their surfaces where they stand, and their numbers."""
+    """The moving colliders of a run, or those at rest: their surfaces at the shape, and their numbers."""
 
     colliders: tuple[Collider, ...]
     surfaces: tuple[Surface, ...]
@@ -44,7 +44,7 @@ class ColliderGroup:
 
     @property
     def name(self) -> str:
-        """Of the VTKHDF file."""
+        """Name of the VTKHDF file."""
         return MOVING if self.moves else RESTING
 
     @property
@@ -54,7 +54,7 @@ class ColliderGroup:
 
     @cached_property
     def meshes(self) -> dict[int, tuple[np.ndarray, np.ndarray]]:
-        """Vertices and triangles of those that are read from files, which may be gone later, by number."""
+        """Vertices and triangles of colliders from files, by number; the files may be gone later."""
         pairs = zip(self.numbers, self.colliders, strict=True)
         forms = {number: form_surface(collider.form) for number, collider in pairs if collider.shape.files}
         return {number: (surface.points, surface.cells) for number, surface in forms.items()}
@@ -72,7 +72,7 @@ class ColliderGroup:
 
 
 class Recorded(Protocol):
-    """What has frames at times, s, and a row of the ledger for each."""
+    """A run with frames at times, s, and a row of the ledger for each."""
 
     times: np.ndarray
 
@@ -81,7 +81,7 @@ class Recorded(Protocol):
 
 
 def as_they_moved(colliders: Sequence[Collider | None], run: Recorded) -> tuple[Collider | None, ...]:
-    """Return the colliders of a run, those that move freely with the motion that its ledger has."""
+    """Return the colliders of a run; free ones have the motion in its ledger."""
     found, free = list(colliders), [k for k, collider in enumerate(colliders) if collider is not None and collider.free]
     ledger = run.ledger if free else ()
     if ledger and len(ledger[0].rigid_pose) == len(free):
@@ -94,7 +94,7 @@ def as_they_moved(colliders: Sequence[Collider | None], run: Recorded) -> tuple[
 def write_collider_files(
     directory: Path, header: Mapping[str, Any], times: Sequence[float], colliders: Sequence[Collider]
 ) -> None:
-    """Write the colliders of a run, if it has any, at the times of its frames, s; RunError where the disk refuses."""
+    """Write the colliders of a run, if it has any, at the times of its frames, s; RunError: a write failed."""
     for group in _groups(header, colliders):
         frames = len(times) if group.moves else 1
         size = 24 * sum(len(s.points) for s in group.surfaces) * frames + 32 * len(group.labels) + 2**16
@@ -106,7 +106,7 @@ def write_collider_files(
 def write_collider_series(
     directory: Path, header: Mapping[str, Any], times: Sequence[float], colliders: Sequence[Collider]
 ) -> list[str]:
-    """Write the colliders of a run as .vtu files and a .pvd, and return their names; RunError: the disk refuses."""
+    """Write the colliders of a run as .vtu files and a .pvd, and return their names; RunError: a write failed."""
     entries: list[tuple[float, int, str]] = []
     for group in _groups(header, colliders):
         size = 64 * (3 * sum(len(s.points) for s in group.surfaces) + 3 * len(group.labels)) + 2**12
@@ -166,7 +166,7 @@ def _groups(header: Mapping[str, Any], colliders: Sequence[Collider]) -> Iterato
 
 @contextmanager
 def _written(directory: Path, name: str, size: int) -> Iterator[Path]:
-    """Give a temporary path to write a file of `size` bytes; RunError where the disk is full or refuses."""
+    """Yield a temporary path for a file of `size` bytes; RunError: the disk is full or a write failed."""
     path = directory / name
     kept = "the frames of the run are kept"
     try:

@@ -1,4 +1,4 @@
-"""The output directory: made, refused, cleared of an earlier result and of nothing else, or closed after a crash."""
+"""The output directory: creates, refuses or clears it, and closes it after a crash."""
 
 import json
 import tempfile
@@ -22,7 +22,7 @@ NAMES = (PACKED, DAMAGED, SCENE, RECORD, RESTING, MOVING)
 
 @dataclass(frozen=True)
 class TakenDirectory:
-    """A directory that this process may write until `release`; of those `made` for it the outermost comes first."""
+    """A directory locked by this process until `release`; `made` lists the directories created, outermost first."""
 
     path: Path
     lock: ExitStack
@@ -37,15 +37,15 @@ class TakenDirectory:
         self.release()
 
     def release(self) -> None:
-        """Let others write; a second call does nothing."""
+        """Release the lock; a second call does nothing."""
         self.lock.close()
 
     def clear(self) -> None:
-        """Remove an earlier result; InputError where it cannot be removed."""
+        """Remove an earlier result; InputError: it cannot be removed."""
         _remove_result(self.path)
 
     def undo(self) -> None:
-        """Remove what a run has written that computed nothing, and the directories made for it."""
+        """Remove the files of a run that computed nothing, and the directories made for it."""
         with suppress(OSError, InputError):
             _remove_result(self.path)
         self.release()
@@ -53,10 +53,10 @@ class TakenDirectory:
 
 
 def take_directory(directory: Path, overwrite: bool, *, resume: bool = False) -> TakenDirectory:
-    """Make sure that `directory` exists, is writable, holds no earlier result and is written by nobody else.
+    """Ensure that `directory` exists, is writable, has no earlier result, and is not being written; lock it.
 
-    With `overwrite` the files that mpmcli writes are removed, and nothing else; with `resume` all stay. InputError, and
-    nothing changed: something is in the way, another process writes it, or it cannot be written.
+    With `overwrite` only the files that mpmcli writes are removed; with `resume` all stay. InputError, and nothing
+    changed: other files are in the way, another process writes it, or it cannot be written.
     """
     directory = Path(directory)
     check_directory(directory, overwrite, resume=resume)
@@ -64,7 +64,7 @@ def take_directory(directory: Path, overwrite: bool, *, resume: bool = False) ->
     lock = None
     try:
         lock = take_lock(directory)
-        # Another run may have come and gone meanwhile.
+        # Another run may have started and ended meanwhile.
         check_directory(directory, overwrite, resume=resume, locked=True)
         if not resume:
             _remove_result(directory)
@@ -77,7 +77,7 @@ def take_directory(directory: Path, overwrite: bool, *, resume: bool = False) ->
 
 
 def check_directory(directory: Path, overwrite: bool, *, resume: bool = False, locked: bool = False) -> None:
-    """Refuse a directory as `take_directory` does, and change nothing; `locked`: this process has its lock."""
+    """Raise the errors of `take_directory` and change nothing; `locked`: this process holds its lock."""
     directory = Path(directory)
     try:
         directory.stat()
@@ -100,7 +100,7 @@ def check_directory(directory: Path, overwrite: bool, *, resume: bool = False, l
 
 def _make(directory: Path) -> list[Path]:
     """Make a directory; return all that were made, outermost first."""
-    # Every missing parent is made too, and taken away again if the whole does not succeed.
+    # Missing parents are made too, and removed again on failure.
     missing = [directory]
     for parent in directory.parents:
         if parent.exists():
@@ -129,7 +129,7 @@ def _unmake(made: Sequence[Path]) -> None:
 
 def _refuse_unwritable(directory: Path) -> None:
     try:
-        # Permission bits do not tell of read-only disks, so a nameless file is tried.
+        # Permission bits do not show read-only disks, so an unnamed file is tried.
         with tempfile.TemporaryFile(dir=directory):
             pass
     except OSError as error:
@@ -143,7 +143,7 @@ def _remove_result(directory: Path) -> None:
         if path.is_dir():
             raise InputError(f"{path} is a directory where mpmcli writes a file: give another place with -o.")
     if (directory / SCENE).exists() and not (has_frames(directory) or read_record(directory) is not None):
-        # With `-o .` it may well be the scene that is about to be run.
+        # With `-o .` it may be the scene that is about to run.
         raise InputError(f"{directory / SCENE} was not written by mpmcli: give another directory with -o.")
     try:
         remove_segments(directory)
@@ -156,15 +156,15 @@ def _remove_result(directory: Path) -> None:
 
 
 def has_frames(directory: Path) -> bool:
-    """Return whether a directory holds a frame of a run."""
+    """Return whether a directory contains a frame of a run."""
     return (directory / PACKED).exists() or bool(sealed_segments(directory))
 
 
 def close_abandoned(directory: Path, made: Sequence[Path], pid: int, signal: str) -> None:
-    """Close the result of a process `pid` that a signal ended by force: run.json says "interrupted".
+    """Close the result of a process `pid` that was killed by a signal: set "interrupted" in run.json.
 
-    Without a frame, what the run has made is removed, with the directories `made` for it, outermost first. A result of
-    another process is left as it is.
+    Without a frame, the files of the run are removed, with the directories `made` for it, outermost first. A result of
+    another process is not changed.
     """
     if not directory.is_dir():
         return

@@ -16,14 +16,14 @@ except ImportError:  # Windows
     resource = None
 
 TEMPORARY_SUFFIX = ".tmp"
-# Bytes left free on top of what is about to be written: file system metadata and other programs.
+# Bytes left free in addition to the data to be written: file system metadata and other programs.
 SPACE_MARGIN = 16 * 1024 * 1024
-# Answers of the system where there is no room.
+# Error codes of the system for a lack of space.
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 def temporary_of(path: Path) -> Path:
-    """Return where a file is written before it takes its name."""
+    """Return the temporary path of a file."""
     return path.with_name(path.name + TEMPORARY_SUFFIX)
 
 
@@ -51,7 +51,7 @@ def sync_directory(directory: Path) -> None:
 
 @contextmanager
 def sealed(path: Path, size: int = 0) -> Iterator[Path]:
-    """Give a temporary path; on leaving, put it at `path` durably. `size` bytes are asked for first, else OSError."""
+    """Yield a temporary path; on exit, move it to `path` durably. OSError: there is no space for `size` bytes."""
     file = Unsealed(path)
     with file.written(size) as temporary:
         yield temporary
@@ -59,21 +59,21 @@ def sealed(path: Path, size: int = 0) -> Iterator[Path]:
 
 
 class Unsealed:
-    """A file that is first written, and then put at its path in one durable step, by another thread maybe."""
+    """A file that is first written, then moved to its path in one durable step, possibly by another thread."""
 
     def __init__(self, path: Path) -> None:
         self.path, self._temporary = path, temporary_of(path)
 
     @contextmanager
     def written(self, size: int = 0) -> Iterator[Path]:
-        """Give a temporary path to write and close; see `sealed`."""
+        """Yield a temporary path to write and close; see `sealed`."""
         with self._removed_on_error():
             if size:
                 ask_for(self._temporary, size)
             yield self._temporary
 
     def seal(self) -> None:
-        """Put the file at its path; where that fails, the temporary one is removed."""
+        """Move the file to its path; on failure, remove the temporary file."""
         with self._removed_on_error():
             sync_file(self._temporary)
             os.replace(self._temporary, self.path)
@@ -84,21 +84,21 @@ class Unsealed:
         try:
             yield
         except BaseException:
-            # The error under way is what the user must see, not a failed clean-up.
+            # The user must see the original error, not a failed clean-up.
             with suppress(OSError):
                 self._temporary.unlink(missing_ok=True)
             raise
 
 
 def ask_for(path: Path, size: int) -> None:
-    """Reserve and release `size` bytes, since HDF5 that is refused space crashes the interpreter at exit."""
+    """Reserve and release `size` bytes; without space HDF5 crashes the interpreter at exit."""
     if not hasattr(os, "posix_fallocate"):
         return
     with open(path, "wb") as file:
         try:
             os.posix_fallocate(file.fileno(), 0, size)
         except OSError as error:
-            # Some file systems cannot reserve; then nothing is learned.
+            # Some file systems cannot reserve space; then this check is void.
             if is_full(error):
                 raise
         file.truncate(0)
@@ -116,13 +116,13 @@ def number_of(path: Path) -> int:
 
 
 def numbered_files(folder: Path, names: re.Pattern[str]) -> list[Path]:
-    """Return the files of a folder with such names, in the order of their numbers; none where it does not exist."""
+    """Return the files of a folder with such names, in the order of their numbers; none if it does not exist."""
     paths = [path for path in folder.iterdir() if names.fullmatch(path.name)] if folder.is_dir() else []
     return sorted(paths, key=number_of)
 
 
 def remove_numbered(folder: Path, names: re.Pattern[str]) -> None:
-    """Remove files with such names, unfinished ones too, and the folder unless something else lies in it."""
+    """Remove files with such names, also unfinished ones, and the folder unless it contains other files."""
     if not folder.is_dir():
         return
     for path in folder.iterdir():
@@ -133,12 +133,12 @@ def remove_numbered(folder: Path, names: re.Pattern[str]) -> None:
 
 
 def is_full(error: BaseException) -> bool:
-    """Return whether an error says that the disk is full, or a quota or a limit on the size of a file reached."""
+    """Return whether an error reports a full disk, an exceeded quota, or the limit on the size of a file."""
     return isinstance(error, OSError) and error.errno in FULL
 
 
 def largest_file() -> int | None:
-    """Return the limit of this process on the size of a file (`ulimit -f`), bytes; None where there is none."""
+    """Return the limit of this process on the size of a file (`ulimit -f`), bytes; None if there is none."""
     if resource is None:
         return None
     limit = resource.getrlimit(resource.RLIMIT_FSIZE)[0]
@@ -148,10 +148,10 @@ def largest_file() -> int | None:
 def require_free_space(
     directory: Path, size: int, purpose: str, kept: str, *, joined: int = 0, several: bool = False
 ) -> None:
-    """Refuse with DiskFullError to write `size` bytes, to `several` files maybe, that the disk cannot hold.
+    """Raise DiskFullError if the disk has no space for `size` bytes, in one file or in `several`.
 
     `purpose` is the subject of the error's sentence ("frame 7"), `kept` its end ("the 7 frames before it are kept");
-    `joined` are bytes of one more file, of this and of what was written before, that is to follow.
+    `joined` are the bytes of one further file that later combines this data with earlier data.
     """
     included = "a margin and the packing of all frames up to it" if joined else "a margin"
     free, largest = shutil.disk_usage(directory).free, largest_file()

@@ -1,4 +1,4 @@
-"""The header of a run: the facts about its scene, laws and backend that every reader of the frames needs."""
+"""The header of a run: the facts about its scene, laws and backend that readers of the frames need."""
 
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -25,7 +25,7 @@ _DEFAULTS = {name: field.default for name, field in SolverSettings.model_fields.
 
 
 class _Facts(BaseModel):
-    """Entries of a file; others are left out, and those that are missing are not known."""
+    """Entries of a file; other entries are ignored, and missing ones are unknown."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -37,7 +37,7 @@ class _Domain(_Facts):
     friction: dict[str, float] | float = 0.0
 
     def faces(self, d: int) -> tuple[tuple[str, str], ...]:
-        """Return the words of the faces along each axis; none where the walls are not known."""
+        """Return the conditions of the faces along each axis; empty if the walls are unknown."""
         if self.walls is None:
             return ()
         table = self.walls if isinstance(self.walls, dict) else {"default": self.walls}
@@ -65,7 +65,7 @@ class _Body(_Facts):
     particles_per_cell: float | None = None
 
     def volume(self, d: int) -> float | None:
-        """Return the volume of the shape, None where that is not known."""
+        """Return the volume of the shape, None if unknown."""
         try:
             return BodyShape.model_validate(self.shape, context={"dimension": d}).form.volume
         except (ValidationError, StopIteration):
@@ -83,7 +83,7 @@ class _Contact(_Facts):
 
 
 class _StoredScene(_Facts):
-    """What is read of a complete scene, of which a shape that is read from a file may be gone."""
+    """The entries of a complete scene that are read; the file of a shape may be gone."""
 
     domain: _Domain = _Domain()
     time: _Time = _Time()
@@ -99,7 +99,7 @@ class _StoredScene(_Facts):
 
 
 class LawHeader(_Facts):
-    """A law: its word in a scene, "J" or "F", whether it coheres, and whether it may yield or flow."""
+    """A law: its name in a scene, "J" or "F", whether it coheres, and whether it may yield or flow."""
 
     model_config = ConfigDict(from_attributes=True)
 
@@ -110,7 +110,7 @@ class LawHeader(_Facts):
 
 
 class _StoredHeader(_Facts):
-    """A header as files hold it; `scene` is TOML there."""
+    """A header as stored in files, with `scene` as TOML."""
 
     version: str | None = None
     title: str = ""
@@ -131,7 +131,7 @@ class _StoredHeader(_Facts):
 
 @dataclass(frozen=True)
 class BodyHeader:
-    """A body of the scene; what is not known is {} or None: `material` is its table, `volume` in m^3 (m^2 in 2D)."""
+    """A body of the scene: `material` is its table, `volume` in m^3 (m^2 in 2D); unknown entries are {} or None."""
 
     name: str
     material: Mapping[str, Any]
@@ -140,38 +140,38 @@ class BodyHeader:
 
     @property
     def density(self) -> float | None:
-        """At rest, kg/m^3; None where not known."""
+        """Density at rest, kg/m^3; None if unknown."""
         return self.material.get("density")
 
 
 @dataclass(frozen=True)
 class RunHeader:
-    """Facts of a run; those that a header does not hold are None, or empty.
+    """Facts of a run; those that the header lacks are None or empty.
 
     Attributes:
-        stored: the entries as files hold them; JSON can hold all of them.
+        stored: the entries as stored in files; all of them are valid JSON.
         title: of the scene; version: of mpmcli.
         dimension: d, 2 or 3.
         spacing: h, m.
         origin, upper: corners of the domain, (d,), m; both are known, or neither.
-        gravity: (d,), m/s^2; None where it depends on time.
-        steady_gravity: (d,), m/s^2, with 0 for each entry that depends on time; None where not known.
-        driven: whether forces act, walls move, gravity depends on time or acts along an axis that repeats, or particles
-            come and go: energy and momentum have a source then.
-        comes_and_goes: whether the last is so; drops: whether frames hold only those that are there.
-        open_axes: per axis, whether a face normal to it is open.
-        total: whether elastic bodies are on the grid of their state at rest.
-        keeps_spin: whether the transfers conserve angular momentum, as those of APIC do where bodies move on the grid.
+        gravity: (d,), m/s^2; None if it depends on time.
+        steady_gravity: (d,), m/s^2, with 0 for each entry that depends on time; None if unknown.
+        driven: whether energy and momentum have a source: forces, moving walls, time-dependent gravity, gravity along a
+            periodic axis, or particles that come and go.
+        comes_and_goes: whether particles come and go; drops: whether frames contain only the particles present.
+        open_axes: for each axis, whether a face normal to it is open.
+        total: whether elastic bodies are computed on the grid of their state at rest.
+        keeps_spin: whether the transfers conserve angular momentum, as APIC does on the updated grid.
         shifts: whether particles of liquids and grains are shifted.
-        sticking: per axis, whether a face normal to it sticks or has friction.
+        sticking: for each axis, whether a face normal to it sticks or has friction.
         periodic: (d,), whether the domain repeats along each axis.
-        faces: the words of the walls, the lower and the upper one of each axis; none where they are not known.
+        faces: the conditions of the lower and the upper wall of each axis; empty if unknown.
         bodies: in the order of their labels in the frames.
         contacts: see `Scene.contact_pairs`.
         laws: in the order of the labels in the frames.
         end: s; frames: expected, the initial one included.
         precision: "f32" or "f64"; backend: "arch" and "precision".
-        scene: what is read of the complete scene.
+        scene: the entries read from the complete scene.
     """
 
     stored: dict[str, Any]
@@ -204,8 +204,8 @@ class RunHeader:
 
     @classmethod
     def of(cls, scene: Scene, text: str, laws: Sequence[Any], backend: Mapping[str, Any]) -> "RunHeader":
-        """Return the header of a run that begins; `text` is the complete scene as TOML, laws as in `Frame.material`."""
-        # A shape that is read from a file may be gone later.
+        """Return the header of a new run; `text` is the complete scene as TOML, laws as in `Frame.material`."""
+        # The file of a shape may be gone later.
         from_files = any(body.shape.files for body in scene.bodies)
         emitted = [sheets_of(emitter, scene) for emitter in scene.emitters]
         return cls.read(
@@ -221,7 +221,7 @@ class RunHeader:
                 "materials": [law.name for law in laws],
                 "laws": [LawHeader.model_validate(law).model_dump(exclude={"name"}) for law in laws],
                 "precision": backend["precision"],
-                # The bytes of a result do not depend on threads; run.json has their number.
+                # The bytes of a result do not depend on the number of threads; run.json has it.
                 "backend": {name: value for name, value in backend.items() if name != "threads"},
                 "scene": text,
             }
@@ -231,7 +231,7 @@ class RunHeader:
 
     @classmethod
     def read(cls, stored: Mapping[str, Any]) -> "RunHeader":
-        """Read a header, and the scene in it; ValidationError, a ValueError: an entry has another type than ours."""
+        """Read a header, and the scene in it; ValidationError, a ValueError: an entry has a wrong type."""
         facts = _StoredHeader.model_validate(dict(stored))
         scene, d = facts.scene, facts.dimension
         domain, solver, faces = scene.domain, scene.solver, scene.domain.faces(d)
@@ -288,16 +288,16 @@ class RunHeader:
 
     @cached_property
     def colliders(self) -> tuple[Collider, ...]:
-        """The colliders that the scene tells all of; one whose mesh is not found is left out."""
+        """The colliders of the scene; one whose mesh is not found is left out."""
         return tuple(collider for collider in self.read_colliders({}) if collider is not None)
 
     @cached_property
     def moved(self) -> bool:
-        """Whether a collider moves as the scene says, which does work; also where it is not known."""
+        """Whether a collider has a prescribed motion, which does work; True if unknown."""
         return any(collider is None or collider.driven for collider in self.read_colliders({}))
 
     def read_colliders(self, surfaces: Mapping[int, ClosedSurface]) -> tuple[Collider | None, ...]:
-        """Read the colliders, None where that fails; `surfaces`, by number, take the place of those in files."""
+        """Read the colliders, None for one that cannot be read; `surfaces`, by number, replace those in files."""
         constants, _ = definitions(self.scene.constants, self.dimension)
         context = {"dimension": self.dimension, "constants": constants}
         return tuple(_collider(table, context, surfaces.get(k)) for k, table in enumerate(self.scene.colliders))
@@ -309,13 +309,13 @@ class RunHeader:
 
     @cached_property
     def densities(self) -> tuple[float, ...]:
-        """Density of each body at rest, kg/m^3; empty where one is not known, or the volume of one."""
+        """Density of each body at rest, kg/m^3; empty if a density or a volume is unknown."""
         known = all(body.volume is not None and body.density is not None for body in self.bodies)
         return tuple(body.density for body in self.bodies) if known else ()
 
     @property
     def epsilon(self) -> float:
-        """Relative rounding of the solver's numbers."""
+        """Relative rounding error of the solver's numbers."""
         return float(np.finfo(np.float64 if self.precision == "f64" else np.float32).eps)
 
     @property
@@ -325,44 +325,44 @@ class RunHeader:
 
     @cached_property
     def farthest(self) -> float:
-        """Largest coordinate of the domain, m: what the rounding of stored positions is relative to; 0 if not known."""
+        """Largest coordinate of the domain, m: the scale of the rounding of stored positions; 0 if unknown."""
         return 0.0 if self.origin is None else float(np.abs([self.origin, self.upper]).max())
 
     @cached_property
     def step_error(self) -> float:
-        """Rounding of a position in one step, m: the solver counts from the corner of the domain."""
+        """Rounding error of a position in one step, m; the solver's origin is the lower corner of the domain."""
         return 0.0 if self.origin is None else self.epsilon * float((self.upper - self.origin).max())
 
     def place_error(self, stored: np.dtype) -> float:
-        """Return the rounding of a position in a file of this type, m, that of the solver included."""
+        """Return the rounding error of a position stored in this type, m, including that of the solver."""
         return self.step_error + float(np.finfo(stored).eps) * self.farthest
 
     def shifted(self, steps: int, last: int) -> float:
-        """Return the farthest that shifts move a particle in so many steps up to the last one, m, of one per cell."""
+        """Return the largest shift of a particle in the `steps` steps up to `last`, m, for one particle per cell."""
         shifts = last // INTERVAL - (last - steps) // INTERVAL
         return shifts * 2 * FARTHEST * self.spacing if self.shifts and self.spacing is not None else 0.0
 
     def body_name(self, label: int) -> str:
-        """Return the name of a body, or its number where it has none."""
+        """Return the name of a body, or its number if it has none."""
         return self.bodies[label].name if 0 <= label < len(self.bodies) else f"number {label}"
 
     def masses(self, body: np.ndarray) -> np.ndarray | None:
-        """Return the mass of each particle, (n,) float64, kg, from the labels (n,); None where it is not known."""
+        """Return the mass of each particle, (n,) float64, kg, from the labels (n,); None if unknown."""
         if self.drops or not self.densities or len(body) == 0 or body.min() < 0 or body.max() >= len(self.bodies):
             return None
         counts = np.bincount(body, minlength=len(self.bodies))
         volumes = np.array([body.volume for body in self.bodies]) / np.maximum(counts, 1)
         masses = np.array(self.densities) * volumes
-        # As the solver holds them, so that sums agree to the last digits.
+        # In the solver's precision, so that sums agree to the last digits.
         kept = masses.astype(np.float64 if self.precision == "f64" else np.float32).astype(np.float64)
         return kept[body]
 
 
 def _bodies(facts: _StoredHeader) -> tuple[BodyHeader, ...]:
-    """Return the bodies and emitters; of other ones than the scene's the names alone."""
+    """Return the bodies and emitters; those that the scene lacks have a name only."""
     names, scene, d = facts.bodies, facts.scene, facts.dimension
     tables = [*scene.bodies, *scene.emitters]
-    # The volume of an emitter is that of all its particles, which its shape alone does not say.
+    # The volume of an emitter is that of all its particles, which does not follow from its shape.
     volumes = [*(facts.volumes or [None] * len(scene.bodies)), *facts.emitter_volumes]
     tables = tables if len(tables) == len(names) else [_Body()] * len(names)
     volumes = volumes if len(volumes) == len(names) else [None] * len(names)

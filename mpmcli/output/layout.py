@@ -1,7 +1,7 @@
-"""How frames lie in files: names and types of their arrays, the padding of 2D to 3D for VTK, and the list of frames.
+"""The layout of frames in files: names and types of arrays, padding of 2D to 3D for VTK, and the list of frames.
 
-The run-time ledger as columns, for HDF5, and as CSV text, for the VTK series. Names of the files that frames are in:
-segments while a run goes on, and one packed file at its end.
+Also the ledger as columns, for HDF5, and as CSV text, for the VTK series; and the names of the files of frames:
+segments during a run, and one packed file at its end.
 """
 
 import csv
@@ -23,7 +23,7 @@ POSITION = "Points"  # VTK's name; every other array keeps its own
 STANDARD = ("id", "body", "material", "velocity")
 # 2D is plane strain: out of the plane F is the identity, and every other tensor is stored as zero.
 OUT_OF_PLANE = {"deformation_gradient": 1.0}
-# What both VTK and meshio read back without conversion.
+# Types that both VTK and meshio read back without conversion.
 DTYPES = tuple(np.dtype(code) for code in ("f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8"))
 
 
@@ -61,7 +61,7 @@ class ArrayLayout:
         return (n,) if self.components is None else (n, self.components)
 
     def pad(self, array: np.ndarray) -> np.ndarray:
-        """Give an array of a Frame, (n, *shape), the form of the file, (n,) or (n, components)."""
+        """Convert an array of a Frame, (n, *shape), to the form in the file, (n,) or (n, components)."""
         n, d = len(array), self.dimension
         if self.is_tensor:
             tensor = array.reshape(n, d, d)
@@ -74,7 +74,7 @@ class ArrayLayout:
         return np.ascontiguousarray(array)
 
     def unpad(self, stored: np.ndarray) -> np.ndarray:
-        """Undo `pad`, bit for bit."""
+        """Inverse of `pad`, exact to the bit."""
         n, d = len(stored), self.dimension
         if self.is_tensor:
             return np.ascontiguousarray(stored.reshape(n, 3, 3)[:, :d, :d]).reshape(n, *self.shape)
@@ -92,7 +92,7 @@ class FrameLayout:
 
     @classmethod
     def of(cls, frame: Frame) -> "FrameLayout":
-        """Read the layout off a frame; ValueError where an array has a shape, type or name that a file cannot hold."""
+        """Return the layout of a frame; ValueError: a file cannot store the shape, type or name of an array."""
         if frame.position.ndim != 2 or frame.position.shape[1] not in (2, 3):
             raise ValueError(f"position must be (n, 2) or (n, 3), not {frame.position.shape}")
         n, d = frame.position.shape
@@ -118,14 +118,14 @@ class FrameLayout:
         return sum(array.bytes_per_particle for array in self.arrays.values())
 
     def stored(self, frame: Frame) -> Iterator[tuple[str, np.ndarray]]:
-        """Yield every array in the form of the file, one at a time; ValueError where the layout is another."""
+        """Yield every array in the form in the file, one at a time; ValueError: the layout differs."""
         if FrameLayout.of(frame) != self:
             raise ValueError(f"frame {frame.index} holds other arrays, types or shapes than the first frame")
         for name, array in _named_arrays(frame):
             yield name, self.arrays[name].pad(array)
 
     def stored_together(self, frames: Sequence[Frame]) -> Iterator[tuple[str, np.ndarray]]:
-        """Yield every array of some frames, one frame after the other, as `stored` does."""
+        """Yield every array of several frames, joined along the rows, as `stored` does."""
         if len(frames) == 1:
             yield from self.stored(frames[0])
             return
@@ -134,20 +134,20 @@ class FrameLayout:
             yield name, np.concatenate([stored.pop(name) for stored in arrays])
 
     def frame(self, index: int, time: float, step: int, stored: Mapping[str, np.ndarray]) -> Frame:
-        """Build the Frame back from arrays in the form of the file; `stored` may leave out fields."""
+        """Return a Frame from arrays in the form in the file; `stored` may lack fields."""
         arrays = {name: self.arrays[name].unpad(array) for name, array in stored.items()}
         arrays.pop("id", None)
         standard = {name: arrays.pop(name) for name in STANDARD[1:]}
         return Frame(index, time, step, position=arrays.pop(POSITION), fields=arrays, **standard)
 
     def to_dict(self) -> dict:
-        """Plain form for JSON."""
+        """Return a form for JSON."""
         shapes = {name: [a.dtype, list(a.shape)] for name, a in self.arrays.items()}
         return {"dimension": self.dimension, "arrays": shapes}
 
     @classmethod
     def from_dict(cls, plain: dict) -> "FrameLayout":
-        """Undo `to_dict`."""
+        """Inverse of `to_dict`."""
         d = plain["dimension"]
         arrays = {name: ArrayLayout(name, dtype, tuple(shape), d) for name, (dtype, shape) in plain["arrays"].items()}
         return cls(d, arrays)
@@ -156,7 +156,7 @@ class FrameLayout:
 def _named_arrays(frame: Frame) -> Iterator[tuple[str, np.ndarray]]:
     n = len(frame.position)
     yield POSITION, frame.position
-    # Row i is particle i, so ids need no storage in most Frames; in the file they let ParaView follow one.
+    # Row i is particle i, so most Frames store no ids; in the file, ids let ParaView follow a particle.
     whole = np.int32 if n < 2**31 else np.int64
     yield "id", np.arange(n, dtype=whole) if frame.id is None else frame.id.astype(whole)
     for name in STANDARD[1:]:
@@ -179,7 +179,7 @@ class FrameIndex:
         frames, steps: (T,) frame number, and time steps since the start.
         offsets, counts: (T,) first row and number of rows of each frame in its file.
         ledger: T rows.
-        checksums: (T, A) uint32, CRC-32 of each array of the layout in each frame; None of what lies in no file.
+        checksums: (T, A) uint32, CRC-32 of each array of the layout in each frame; None if the frames are in no file.
     """
 
     layout: FrameLayout
@@ -199,7 +199,7 @@ class FrameIndex:
 
     @staticmethod
     def joined(indices: Sequence["FrameIndex"]) -> "FrameIndex":
-        """The index that one file with the frames of all these, one after the other, has."""
+        """Return the index of one file with the frames of all indices, in order."""
         names = ("times", "frames", "steps", "counts", "checksums")
         tables = {name: np.concatenate([getattr(index, name) for index in indices]) for name in names}
         return replace(
@@ -214,11 +214,11 @@ COLUMNS = tuple(f.name for f in fields(LedgerRow))
 # A row for each collider, pair or body.
 PER_PART = (*LOADS, *RIGID)
 VECTORS = ("linear_momentum", "angular_momentum")
-# Of scenes in which particles come and go, or bodies separate; elsewhere they are None, and not stored.
+# For scenes in which particles come and go or bodies separate; otherwise None and not stored.
 OPTIONAL = ("emitted", "emitted_mass", "retired", "retired_mass", "blocked", "contact_overlap", "contact_gap")
 INTEGERS = ("steps", "emitted", "retired", "blocked")
 TEXT = "limit"
-# What is read where a file has no such column.
+# Values for columns that a file lacks.
 MISSING = {**dict.fromkeys(PER_PART, ()), **dict.fromkeys(OPTIONAL)}
 # Columns of each frame in the CSV: its number, time steps since the start, particles.
 FRAME_COLUMNS = ("frame", "step", "particles")
@@ -240,7 +240,7 @@ def ledger_columns(rows: Sequence[LedgerRow]) -> dict[str, np.ndarray]:
 
 
 def _stored(rows: Sequence[LedgerRow]) -> tuple[str, ...]:
-    """Return the names of the columns of some rows of one run."""
+    """Return the names of the columns of rows of one run."""
     return tuple(name for name in COLUMNS if name not in OPTIONAL or (rows and getattr(rows[0], name) is not None))
 
 
@@ -250,7 +250,7 @@ def read_ledger(group: h5py.Group, read: Callable[[str], np.ndarray]) -> list[Le
 
 
 def ledger_rows(columns: Mapping[str, np.ndarray]) -> list[LedgerRow]:
-    """Undo `ledger_columns`; a column of `MISSING` may be absent."""
+    """Inverse of `ledger_columns`; a column of `MISSING` may be absent."""
     lists = []
     for name in COLUMNS:
         if name in MISSING and name not in columns:
@@ -268,7 +268,7 @@ def ledger_rows(columns: Mapping[str, np.ndarray]) -> list[LedgerRow]:
 
 
 def ledger_csv(rows: Sequence[LedgerRow], frames: Sequence[tuple[int, ...]]) -> str:
-    """Write T rows as CSV with a header line, after `FRAME_COLUMNS`; numbers have the digits that read back exactly."""
+    """Write T rows as CSV with a header line, after `FRAME_COLUMNS`; numbers read back exactly."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     for i, row in enumerate(rows):
@@ -289,7 +289,7 @@ def ledger_csv(rows: Sequence[LedgerRow], frames: Sequence[tuple[int, ...]]) -> 
 
 
 PACKED = "particles.vtkhdf"
-# A damaged one is kept by this name until it has been computed again.
+# A damaged segment keeps this name until it has been computed again.
 DAMAGED = "particles.vtkhdf.damaged"
 SEGMENTS = "segments"
 SEGMENT_NAME = re.compile(r"frame_\d{6,}\.vtkhdf")
@@ -301,10 +301,10 @@ def segment_name(index: int) -> str:
 
 
 def sealed_segments(directory: Path) -> list[Path]:
-    """Return the sealed segments of a run that was not packed, in order, without unfinished files."""
+    """Return the sealed segments of an unpacked run, in order, without unfinished files."""
     return numbered_files(directory / SEGMENTS, SEGMENT_NAME)
 
 
 def remove_segments(directory: Path) -> None:
-    """Remove sealed and unfinished segments, and their folder unless something else lies in it."""
+    """Remove sealed and unfinished segments, and their folder unless it contains other files."""
     remove_numbered(directory / SEGMENTS, SEGMENT_NAME)

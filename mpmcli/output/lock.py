@@ -1,8 +1,8 @@
-"""The lock of a directory that is being written: one writer at a time, and a file that names it.
+"""The lock of a directory: one writer at a time, named in a lock file.
 
-The system holds the lock (flock), and releases it however the process ends; the content of the file tells who has it,
-apart from every other process, also after it has ended. The file is removed with the lock, so that one that stays
-behind is of a process that was killed.
+The operating system holds the lock (flock) and releases it however the process ends. The content of the file identifies
+the owner uniquely, also after it has ended. The file is removed with the lock, so that a remaining file belongs to a
+process that was killed.
 """
 
 import errno
@@ -26,13 +26,13 @@ except ImportError:  # Windows
     fcntl = None
 
 LOCK = "run.lock"
-# Time for which a lock may be held by a process that looks at it, or that is just being killed, s.
+# Time for which a process that inspects the lock, or is being killed, may hold it, s.
 PATIENCE = 0.5
 PAUSE = 0.02
-# What a file system answers that has no locks.
+# Error codes of a file system without locks.
 NO_LOCKS = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL)
 BOOT_ID, MACHINE_ID = Path("/proc/sys/kernel/random/boot_id"), Path("/etc/machine-id")
-# Where boot identifiers are missing, boots count as the same whose times differ by less, s.
+# Without boot identifiers, boots whose times differ by less count as the same, s.
 SAME_BOOT = 60.0
 
 Life = Literal["lives", "ended", "elsewhere"]
@@ -40,10 +40,10 @@ Life = Literal["lives", "ended", "elsewhere"]
 
 @dataclass(frozen=True)
 class Owner:
-    """A process, as others can recognise it.
+    """A process, identified for other processes.
 
-    `space` tells namespaces of process numbers apart. It `started` at clock ticks since boot on Linux, which no change
-    of the clock moves, else at seconds since 1970. `host` is a hash of the machine's name and identifier, as run.json
+    `space` identifies the namespace of process numbers. `started` is in clock ticks since boot on Linux, independent of
+    changes of the clock, else in seconds since 1970. `host` is a hash of the machine's name and identifier, as run.json
     is published with its data; `boot` identifies the boot.
     """
 
@@ -61,7 +61,7 @@ class Owner:
 
     @classmethod
     def read(cls, facts: Any) -> "Owner | None":
-        """Return the owner whose fields were written, None where these are not such facts."""
+        """Return the owner from written fields, None if the fields are invalid."""
         try:
             words = {name: str(facts[name]) for name in ("host", "boot")}
             return cls(int(facts["pid"]), float(facts["started"]), space=str(facts.get("space", "")), **words)
@@ -70,14 +70,14 @@ class Owner:
 
     @property
     def shares_kernel(self) -> bool:
-        """Whether it runs or ran under the running kernel, in which locks of files tell of all processes."""
+        """Whether it runs or ran under the running kernel, whose file locks cover all processes."""
         with suppress(ValueError):
             return abs(float(self.boot) - float(_boot())) < SAME_BOOT
         return self.boot == _boot()
 
     @property
     def life(self) -> Life:
-        """Whether the process lives; "elsewhere" where that cannot be seen from here."""
+        """Whether the process lives; "elsewhere" if this process cannot tell."""
         if self.shares_kernel:
             if self.space != _space():
                 return "elsewhere"
@@ -87,9 +87,9 @@ class Owner:
 
 
 def process_start(pid: int) -> float | None:
-    """Return when a process began, see `Owner.started`; None where there is no such process, or only its remains."""
+    """Return the start of a process, see `Owner.started`; None if there is no such process, or a zombie."""
     try:
-        # The second field, the name, may hold anything.
+        # The second field, the name, may contain any character.
         fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()
         return None if fields[0] in "ZX" else float(fields[19])
     except FileNotFoundError:
@@ -136,12 +136,12 @@ def _space() -> str:
 
 
 def take_lock(directory: Path) -> ExitStack:
-    """Take the lock of a directory, also from a process that has ended; InputError: another has it, or may have it.
+    """Take the lock of a directory, also from a process that has ended; InputError: another process may hold it.
 
-    What is returned gives the lock free when it is closed, for the first time. The file is removed then.
+    The first close of the returned stack releases the lock and removes the file.
 
-    Between the look and the taking nothing can come: only the holder of the system's lock reads, writes and removes the
-    file. Where a file system has no locks, two processes may take it over at the same moment.
+    Inspection and acquisition are atomic: only the holder of the system's lock reads, writes and removes the file. On a
+    file system without locks, two processes may take over the lock at the same moment.
     """
     path = Path(directory) / LOCK
     until = time.monotonic() + PATIENCE
@@ -175,7 +175,7 @@ def take_lock(directory: Path) -> ExitStack:
             if isinstance(error, OSError):
                 raise refused(directory, "locked", error) from error
             raise
-        # Another process has it, or its holder has removed the file between the two calls.
+        # Another process holds it, or the holder has removed the file between the two calls.
         os.close(descriptor)
         if got is False:
             time.sleep(PAUSE)
@@ -187,7 +187,7 @@ def _remove(path: Path) -> None:
 
 
 def refuse_locked(directory: Path) -> None:
-    """Refuse a directory that another process is writing, as `take_lock` does; nothing is taken or changed."""
+    """Raise the InputError of `take_lock` for a directory that another process is writing; change nothing."""
     path = Path(directory) / LOCK
     until = time.monotonic() + PATIENCE
     while lock_is_held(directory):
@@ -199,7 +199,7 @@ def refuse_locked(directory: Path) -> None:
 
 
 def lock_is_held(directory: Path) -> bool:
-    """Return whether a process has the lock of a directory; False also where the system cannot tell."""
+    """Return whether a process holds the lock of a directory; False also if the system cannot tell."""
     try:
         descriptor = os.open(Path(directory) / LOCK, os.O_RDONLY)
     except OSError:
@@ -211,7 +211,7 @@ def lock_is_held(directory: Path) -> bool:
 
 
 def _lock(descriptor: int, *, exclusive: bool) -> bool | None:
-    """Return whether the system gave the lock; None where it has no locks."""
+    """Return whether the system granted the lock; None if it has no locks."""
     if fcntl is None:
         return None
     try:
@@ -241,7 +241,7 @@ def _content(path: Path) -> dict[str, Any]:
 
 
 def _refuse_foreign(directory: Path, content: dict[str, Any], *, locks_work: bool) -> None:
-    """Refuse a file whose owner may live although the system gives the lock."""
+    """Refuse a lock file whose owner may live although the system grants the lock."""
     owner = Owner.read(content)
     if owner is None or (locks_work and owner.shares_kernel) or owner.life == "ended":
         return
@@ -250,13 +250,13 @@ def _refuse_foreign(directory: Path, content: dict[str, Any], *, locks_work: boo
             raise InputError(_held(directory, content))
         return
     raise InputError(
-        f"{directory} was locked by {_named(content)}, and whether that process has ended cannot be seen from here: "
+        f"{directory} was locked by {_named(content)}, and whether that process has ended cannot be determined: "
         f"if it has, remove {Path(directory) / LOCK}; or give another directory with -o."
     )
 
 
 def refused(directory: Path, what: str, error: OSError) -> InputError:
-    """Return the error of a directory that cannot be "made", "written" or "locked"."""
+    """Return the error for a directory that cannot be "made", "written" or "locked"."""
     return InputError(f"{directory} cannot be {what} ({error.strerror or error}): give another place with -o.")
 
 
@@ -268,7 +268,7 @@ def _held(directory: Path, content: dict[str, Any]) -> str:
 
 
 def _named(content: dict[str, Any]) -> str:
-    """Return who holds a lock, in words; what a file says is printed without control characters."""
+    """Return the holder of a lock in words; control characters of the file are removed."""
     owner = Owner.read(content)
     if owner is None:
         return "another process"

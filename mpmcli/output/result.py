@@ -1,4 +1,4 @@
-"""Reading results: packed file, directory, running or broken directory, all alike."""
+"""Reads results: a packed file, or the directory of a finished, running or interrupted run."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
@@ -37,10 +37,10 @@ class Result(ABC):
         header: facts about the run.
         dimension: 2 or 3.
         field_names: the fields of each Frame, without position, velocity, body and material.
-        record: content of run.json, None where there is none.
-        index: tables of all frames, as the files hold them.
-        status: how the run stands, see `run_status`.
-        collider_frames: for each collider the number of the only frame that it is in; None where all are in all.
+        record: content of run.json, None if there is none.
+        index: tables of all frames, as stored.
+        status: status of the run, see `run_status`.
+        collider_frames: for each collider the number of the only frame with it; None if all frames have all.
     """
 
     kind: Kind
@@ -66,7 +66,7 @@ class Result(ABC):
 
     @cached_property
     def colliders(self) -> tuple[Collider, ...]:
-        """The colliders of the scene; one whose mesh is neither found nor stored beside the frames is left out."""
+        """The colliders of the scene; one whose mesh is neither found nor stored with the frames is left out."""
         directory = self.path if self.path.is_dir() else self.path.parent
         found = self.header.read_colliders(read_stored_surfaces(directory))
         found = as_they_moved(found, self)
@@ -91,13 +91,13 @@ class Result(ABC):
         return index.layout.frame(int(index.frames[k]), float(self.times[k]), int(index.steps[k]), stored)
 
     def present_frame(self, k: int, fields: Sequence[str] | None = None) -> Frame:
-        """Read the k-th frame as `frame` does, of the particles that are there alone, where some come or go."""
+        """Read the k-th frame as `frame` does, with only the particles present if particles come or go."""
         if STATUS in self.field_names and fields is not None and STATUS not in fields:
             fields = (*fields, STATUS)
         return self.frame(k, fields).of_present
 
     def stored(self, k: int) -> dict[str, np.ndarray]:
-        """Read all arrays of the k-th frame in the form of the file, (n,) or (n, components)."""
+        """Read all arrays of the k-th frame in the form in the file, (n,) or (n, components)."""
         return self._read(k, [POSITION, *STANDARD, *self.field_names])
 
     def frames(self, fields: Sequence[str] | None = None) -> Iterator[Frame]:
@@ -107,14 +107,14 @@ class Result(ABC):
 
     @abstractmethod
     def _read(self, k: int, names: Sequence[str]) -> dict[str, np.ndarray]:
-        """Read arrays of the k-th frame in the form of the file."""
+        """Read arrays of the k-th frame in the form in the file."""
 
 
 class _StoredResult(Result):
     def __init__(self, path: Path, kind: Kind, files: Sequence[Path]) -> None:
         self.kind = kind
         indices = [read_index_of(file) for file in files]
-        # Of each frame: its file, and its first row there.
+        # For each frame: its file, and its first row there.
         self._places = [
             (file, int(offset)) for file, index in zip(files, indices, strict=True) for offset in index.offsets
         ]
@@ -128,7 +128,7 @@ class _StoredResult(Result):
             packed = self.path / PACKED
             if file.exists() or not packed.exists():
                 raise
-            # The run has ended since, and its frames were packed: the same ones, and perhaps more.
+            # The run has ended since, and its frames were packed: the same frames, perhaps more.
             return self._read_arrays(packed, k, names, int(self.index.offsets[k]))
 
     def _read_arrays(self, path: Path, k: int, names: Sequence[str], offset: int) -> dict[str, np.ndarray]:
@@ -144,23 +144,23 @@ class _StoredResult(Result):
 
 
 def result_place(path: Path) -> Path:
-    """Return the file or the directory of frames that is meant by the folder of segments, or by a file of a series."""
+    """Return the file or the directory of frames for a path to the folder of segments, or to a file of a series."""
     path = Path(path)
     if path.name == SEGMENTS and path.is_dir():
         return path.parent
-    # The series that mpmcli writes has the frames of the file beside it.
+    # A series written by mpmcli has the frames of the packed file next to it.
     return path.with_name(PACKED) if path.suffix in (".pvd", ".vtu") else path
 
 
 def open_result(path: Path) -> Result:
-    """Open what a run has written, whether it ended, was broken off, or is still under way.
+    """Open the result of a run that has ended, was interrupted, or is still running.
 
     Args:
         path: a packed file, its directory, the directory of a run that was not packed (its sealed
             frames are read, unfinished files are ignored), or a file of the series beside the packed file.
 
     Raises:
-        InputError: there is nothing at `path`, or nothing that mpmcli wrote, or no frame yet.
+        InputError: `path` does not exist, was not written by mpmcli, or has no frame yet.
     """
     path = result_place(path)
     packed = path / PACKED if path.is_dir() else path
@@ -168,7 +168,7 @@ def open_result(path: Path) -> Result:
         try:
             return _StoredResult(path, "segments", segments)
         except InputError:
-            # The run may have ended, and its frames been packed, while they were listed.
+            # The run may have ended and packed its frames while they were listed.
             if not packed.exists():
                 raise
     if packed.exists():

@@ -1,4 +1,4 @@
-"""run.json: what was run, where, how far it came and how it ended."""
+"""run.json: command, machine, progress and outcome of a run."""
 
 import json
 import os
@@ -29,21 +29,21 @@ class RunRecord:
     """The record of one run; `write` replaces run.json in one durable step, at any moment.
 
     Attributes:
-        directory: where run.json goes; not part of it.
-        command: command line, the program's name first and without its path.
-        backend: arch, threads, precision, and device name where known, of the backend that really came.
+        directory: directory of run.json; not part of it.
+        command: command line; the program's name comes first, without its path.
+        backend: arch, threads, precision, and device name if known, of the backend in use.
         files: SHA-256 of each file that the scene reads, by name.
-        resumed: for each time that the run went on: when (at), frames kept, and the step it went on from.
+        resumed: for each resumption: its time (at), the frames kept, and the first step.
         seeds: seed of each body by name, for those that have one.
-        forced: whether time.step is taken as it is, by --force.
+        forced: whether --force keeps time.step as given.
         frames_expected, particles: as planned.
-        notes: sentences about what was chosen for the user ("auto" values).
-        status: "running" until `close`; "interrupted" by a signal, "stopped" at a limit or for want of room.
-        frames_written, steps, time: how far the run came; time in s.
+        notes: sentences about automatic choices ("auto" values).
+        status: "running" until `close`; "interrupted" by a signal, "stopped" at a limit or for lack of space.
+        frames_written, steps, time: progress of the run; time in s.
         timings: seconds by name: compile_s, solve_s, output_s, wall_s.
-        limits: number of frames in which each bound on the step was the nearest.
-        energy: J; first, last, and the largest and smallest total seen.
-        failure: why a run ended early: message, and step, time, particle, ... where known.
+        limits: number of frames in which each bound on the step was the smallest.
+        energy: J; first, last, largest and smallest total.
+        failure: reason of an early end: message, and step, time, particle, ... if known.
     """
 
     directory: Path
@@ -68,7 +68,7 @@ class RunRecord:
     ended: str | None = None
 
     def observe(self, row: LedgerRow) -> None:
-        """Count one frame that has been written; does not write."""
+        """Count one written frame; does not write."""
         self.frames_written += 1
         self.steps += row.steps
         self.time = row.time
@@ -81,14 +81,14 @@ class RunRecord:
         self.energy["largest"] = max(energy, self.energy.get("largest", energy))
 
     def go_on_from(self, earlier: Mapping[str, Any], rows: Sequence[LedgerRow], step: int) -> None:
-        """Go on with an earlier run.json after `rows`, those of the frames that are there, from `step`."""
+        """Continue an earlier run.json from `step`, after `rows`, those of the existing frames."""
         for row in rows:
             self.observe(row)
         self.started = str(earlier.get("started", self.started))
         self.resumed = [*earlier.get("resumed", ()), {"at": time_now(), "frames": len(rows), "step": step}]
 
     def close(self, status: Status, message: str = "", **facts: Any) -> None:
-        """Set how the run ended, and the sentence and `facts` (step, time, particle, ...) why, and write."""
+        """Set the outcome of the run, its reason as a sentence and `facts` (step, time, particle, ...), and write."""
         self.status = status
         self.ended = time_now()
         if message or facts:
@@ -96,7 +96,7 @@ class RunRecord:
         self.write()
 
     def write(self) -> None:
-        """Replace run.json by the present state, in one durable step; RunError where the disk is full or refuses."""
+        """Replace run.json by the current state, in one durable step; RunError: the disk is full or a write failed."""
         facts = asdict(self)
         del facts["directory"]
         facts["command"] = [Path(word).name if i == 0 else word for i, word in enumerate(self.command)]
@@ -104,7 +104,7 @@ class RunRecord:
             taichi = version("taichi")
         except PackageNotFoundError:
             taichi = None
-        # What a figure depends on and a name does not; "process" tells machines apart.
+        # Facts that timings depend on and file names do not; "process" identifies the machine.
         host = {
             "python": platform.python_version(),
             "taichi": taichi,
@@ -122,7 +122,7 @@ class RunRecord:
 
 
 class _StoredRecord(BaseModel):
-    """What is read of run.json; its other entries are taken as they are."""
+    """The validated entries of run.json; other entries are kept as they are."""
 
     model_config = ConfigDict(extra="allow")
 
@@ -142,7 +142,7 @@ class _StoredRecord(BaseModel):
 
 
 def read_record(directory: Path) -> dict[str, Any] | None:
-    """Read run.json; None when there is none, or it is damaged or not of mpmcli."""
+    """Read run.json; None if it does not exist, is damaged, or is not of mpmcli."""
     try:
         text = (Path(directory) / RECORD).read_bytes()
         return _StoredRecord.model_validate_json(text).model_dump(exclude_unset=True)
@@ -151,14 +151,14 @@ def read_record(directory: Path) -> dict[str, Any] | None:
 
 
 def _plain(value: Any) -> Any:
-    """Give numpy values and paths a JSON form."""
+    """Convert numpy values and paths to JSON values."""
     return finite_json(value.tolist()) if hasattr(value, "tolist") else str(value)
 
 
 def run_status(directory: Path, record: dict[str, Any] | None) -> str:
     """Return the status of a run from its record and the lock of its directory, "unknown" without a record.
 
-    "running" without a lock or living process is "died", or `ELSEWHERE` if that cannot be seen from here.
+    "running" without a lock or living process becomes "died", or `ELSEWHERE` if this process cannot tell.
     """
     status = str((record or {}).get("status", "unknown"))
     if record is None or status != "running":

@@ -1,4 +1,4 @@
-"""The form for ParaView before 5.12: a .vtu file of each frame, a .pvd that lists them, and the ledger as CSV."""
+"""The format for ParaView before 5.12: a .vtu file for each frame, a .pvd that lists them, and the ledger as CSV."""
 
 import re
 from collections.abc import Callable, Sequence
@@ -19,12 +19,12 @@ from mpmcli.scene.colliders import Collider
 SERIES, SERIES_LEDGER = "particles.pvd", "ledger.csv"
 SERIES_FILES = (SERIES, SERIES_LEDGER, SUMS, COLLIDERS, RESTING_PIECE)
 SERIES_FRAME = re.compile(r"particles_\d{6,}\.vtu")
-# Each particle is a cell of its own: number, offset and type.
+# Each particle is one cell: number, offset and type.
 _CELL_BYTES, _FILE_BYTES = 24, 64 * 1024
 
 
 def is_series_file(name: str) -> bool:
-    """Return whether a file has the name of one of a series."""
+    """Return whether a name is that of a file of a series."""
     return name in SERIES_FILES or bool(SERIES_FRAME.fullmatch(name) or MOVING_FRAME.fullmatch(name))
 
 
@@ -35,10 +35,10 @@ def write_series(
     compress: bool = False,
     stop: Callable[[], bool] = lambda: False,
 ) -> Path:
-    """Write the frames of the packed result in a directory beside it, with checksums, and return the .pvd.
+    """Write the frames of the packed result to a series in the same directory, with checksums, and return the .pvd.
 
-    It appears as a whole or not at all. `compress` is zlib. RunError: the disk is full or refuses; KeyboardInterrupt:
-    `stop` says so.
+    The series appears as a whole or not at all. `compress` uses zlib. RunError: the disk is full or a write failed;
+    KeyboardInterrupt: `stop` returned True.
     """
     result = open_result(directory / PACKED)
     index = result.index
@@ -73,7 +73,7 @@ def write_series(
 
 
 def remove_series(directory: Path) -> None:
-    """Remove the files of a series, and nothing else."""
+    """Remove the files of a series and no others."""
     for path in directory.iterdir():
         if is_series_file(path.name):
             path.unlink(missing_ok=True)
@@ -84,5 +84,5 @@ def _write_vtu(path: Path, arrays: dict[str, np.ndarray], *, compress: bool) -> 
 
     points = arrays.pop(POSITION)
     mesh = Mesh(points, [("vertex", np.arange(len(points)).reshape(-1, 1))], point_data=arrays)
-    # The writer is named, because meshio.write would choose one by the end of the temporary name.
+    # The writer is named because meshio.write would choose one by the suffix of the temporary name.
     vtu.write(path, mesh, compression="zlib" if compress else None, header_type="UInt64")

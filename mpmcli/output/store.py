@@ -1,6 +1,6 @@
-"""The store of a run: sealed segments of one or more frames while it goes on, one packed VTKHDF file at the end.
+"""The store of a run: sealed segments of one or more frames during the run, one packed VTKHDF file at the end.
 
-Packing: many sealed files become one file, proved equal before it takes its name.
+Packing copies the segments to one file and verifies it before it takes its name.
 """
 
 import os
@@ -34,11 +34,11 @@ from mpmcli.output.verify import verify_file
 from mpmcli.output.vtkhdf import VtkhdfWriter, file_size, read_blocks, read_index_of
 from mpmcli.scene.colliders import Collider
 
-# Bytes of waiting frames above which they are sealed.
+# Bytes of waiting frames that trigger a seal.
 MOST_WAITING = 32 * 1024 * 1024
-# Bytes of frames that a thread seals beside the run; fewer are sealed sooner than a thread is begun.
+# Bytes of frames from which on a thread seals them in parallel to the run; a thread costs more than sealing fewer.
 ASIDE = 4 * 1024 * 1024
-# Longest time between the computation of a frame of a run and its seal, s, unless a single step takes longer.
+# Longest time between the computation of a frame and its seal, s, unless a single step takes longer.
 HOLD = 1.0
 
 
@@ -46,12 +46,12 @@ class SegmentStore:
     """Writes the frames of one run into `directory`/segments, and `directory`/particles.vtkhdf by `finish`.
 
     Frames are sealed in groups, since a durable file costs about 10 ms, within `hold` s of their write if `seal_due` is
-    called. Only sealed ones, which no crash harms, count as `frames_written`, in `seconds` of wall time. Large groups
-    are sealed by a thread, one at a time: they lie in the memory of the system then, and the disk takes its time.
-    Taichi holds Python's lock during a launch, so that a thread could do little more.
+    called. Only sealed frames, which survive a crash, count as `frames_written`, in `seconds` of wall time. A thread
+    seals large groups, one at a time, while the system transfers them from memory to the disk. Taichi holds Python's
+    lock during a launch, so that a thread could do little more.
 
-    Segments are complete VTKHDF files, not compressed, so that writing does not hold up the run. `colliders` are None
-    for those that the header tells.
+    Segments are complete VTKHDF files, uncompressed, so that writing does not delay the run. `colliders` None means
+    those of the header.
     """
 
     def __init__(
@@ -63,7 +63,7 @@ class SegmentStore:
         hold: float = 0.0,
         colliders: Sequence[Collider] | None = None,
     ) -> None:
-        """Begin in a directory that `take_directory` made; nothing is written before the first frame."""
+        """Begin in a directory made by `take_directory`; write nothing before the first frame."""
         self._colliders = RunHeader.read(header).colliders if colliders is None else tuple(colliders)
         self._directory = Path(directory)
         self.place = self._directory / SEGMENTS
@@ -76,25 +76,25 @@ class SegmentStore:
         self._sealing: _Sealing | None = None
         self.frames_written = self.bytes_written = 0
         self.seconds = 0.0
-        # Frames that an earlier process has written.
+        # Frames written by an earlier process.
         self._kept = 0
         self._sealed: set[str] = set()
         self._counts: list[int] = []
 
     def go_on_after(self, index: FrameIndex) -> None:
-        """Go on after frames that an earlier process has written here; they are not written again."""
+        """Continue after frames written by an earlier process; they are not written again."""
         self._layout = index.layout
         self.frames_written = self._kept = len(index.times)
         self._start()
-        # A process that was killed while it packed has left one.
+        # A process killed while packing has left one.
         temporary_of(self._directory / PACKED).unlink(missing_ok=True)
         self._sealed = {path.name for path in sealed_segments(self._directory)}
         self._counts = index.counts.tolist()
 
     def write(self, frame: Frame, row: LedgerRow) -> None:
-        """Take the next frame, whose arrays must not change; seal when MOST_WAITING bytes or `hold` are reached.
+        """Add the next frame, whose arrays must not change; seal when MOST_WAITING bytes or `hold` are reached.
 
-        One that an earlier process has written is left as it is. RunError: the disk refuses, earlier frames are kept;
+        A frame written by an earlier process is kept as it is. RunError: a write failed, earlier frames are kept;
         InputError: the directory holds a result; ValueError: the frame is out of order, or has other arrays.
         """
         if frame.index < self._kept:
@@ -125,18 +125,18 @@ class SegmentStore:
             self._begin_seal()
 
     def seal(self) -> None:
-        """Write all waiting frames durably; RunError: the disk refuses, and the frames before them are kept."""
+        """Write all waiting frames durably; RunError: a write failed, and the frames before them are kept."""
         self._begin_seal()
         self._end_seal()
 
     def finish(self, stop: Callable[[], bool] = lambda: False) -> Path | None:
-        """Seal, pack and verify all frames, and return the packed file, None without a frame.
+        """Seal, pack and verify all frames, and return the packed file, None if there is no frame.
 
-        The segments stay where it cannot be written (RunError), or `stop` ends it with KeyboardInterrupt.
+        The segments stay if it cannot be written (RunError) or `stop` ends packing with KeyboardInterrupt.
         """
         self.seal()
         segments = sealed_segments(self._directory)
-        # An interrupt may fall between the seal and the count; a sealed frame is never left behind.
+        # An interrupt may occur between the seal and the count; every sealed frame is packed.
         if missing := self._sealed - {path.name for path in segments}:
             raise RunError(
                 f"{self._directory / SEGMENTS} lacks {min(missing)}, one of the {len(self._sealed)} "
@@ -154,7 +154,7 @@ class SegmentStore:
             index = read_index_of(packed)
             colliders = as_they_moved(self._colliders, index)
             write_collider_files(self._directory, self._header, index.times.tolist(), colliders)
-        # The result is complete; a segment that somebody holds open may stay beside it.
+        # The result is complete; a segment that another process holds open may remain.
         with suppress(OSError):
             remove_segments(self._directory)
         return packed
@@ -167,7 +167,7 @@ class SegmentStore:
         sync_directory(self._directory)
 
     def _begin_seal(self) -> None:
-        """Write all waiting frames, and begin to make them durable; those before are sealed then."""
+        """Write all waiting frames and begin to make them durable; all frames before them are then sealed."""
         self._end_seal()
         if not self._waiting:
             return
@@ -201,7 +201,7 @@ class SegmentStore:
         self.seconds += sealing.seconds
 
     def _failure(self, error: Exception, purpose: str) -> Exception:
-        """Give up the waiting frames, and return the error of frames that could not be written."""
+        """Drop the waiting frames, and return the error for frames that could not be written."""
         self._waiting.clear()
         if isinstance(error, RunError) or not isinstance(error, OSError | RuntimeError):
             return error
@@ -212,7 +212,7 @@ class SegmentStore:
     def _write(
         self, layout: FrameLayout, frames: Sequence[Frame], rows: Sequence[LedgerRow], size: int
     ) -> Callable[[], None]:
-        """Write frames to a segment; return what makes them durable."""
+        """Write frames to a segment; return the function that makes it durable."""
         counts = [len(frame.position) for frame in frames]
         file = Unsealed(self.place / segment_name(frames[0].index))
         with file.written(size) as temporary, VtkhdfWriter(temporary, layout, counts) as writer:
@@ -223,7 +223,7 @@ class SegmentStore:
             tables = zip(*((frame.time, frame.index, frame.step) for frame in frames), strict=True)
             writer.finish(*tables, rows, self._header)
 
-        # It keeps no frame: another one is built meanwhile.
+        # The function keeps no frame: the next ones are built meanwhile.
         def seal() -> None:
             file.seal()
             self._sealed.add(file.path.name)
@@ -233,7 +233,7 @@ class SegmentStore:
 
 
 class _Sealing:
-    """Frames that become durable, `aside` in a thread or at once; seconds from the beginning of their write."""
+    """Frames being made durable, in a thread (`aside`) or at once; `seconds` from the beginning of their write."""
 
     def __init__(
         self, seal: Callable[[], None], purpose: str, frames: int, size: int, began: float, *, aside: bool
@@ -260,14 +260,14 @@ class _Sealing:
         return self._thread is None or not self._thread.is_alive()
 
     def wait(self) -> Exception | None:
-        """Wait for the end, and return the error of what failed."""
+        """Wait for the end, and return the error, if any."""
         if self._thread is not None:
             self._thread.join()
         return self._error
 
 
 def _frames_kept(count: int) -> str:
-    """Return the end of the sentence on a failed frame: what became of the `count` frames before it."""
+    """Return the end of the sentence on a failed frame, about the `count` frames before it."""
     if count == 0:
         return "no frame was written before it"
     return "the frame before it is kept" if count == 1 else f"the {count} frames before it are kept"
@@ -285,11 +285,10 @@ def pack_segments(
     header: Mapping[str, Any],
     stop: Callable[[], bool] = lambda: False,
 ) -> None:
-    """Write all frames of sealed segments of one run into `target`, prove it equal, then give it its name.
+    """Write all frames of sealed segments of one run to `target`, verify it, then give it its name.
 
-    Segments stay as they are; memory is that of a block of one array. "scene" of the header may differ from that of the
-    segments.
-    RunError, and no `target`: the disk is too small, segments are of several runs, or it does not read back.
+    Segments are not changed; memory is that of a block of one array. "scene" of the header may differ from that of the
+    segments. RunError, and no `target`: the disk is too small, segments are of several runs, or verification failed.
     """
     try:
         parts = [(segment, read_index_of(segment)) for segment in segments]
@@ -310,7 +309,7 @@ def pack_segments(
         with sealed(target, size) as temporary:
             with VtkhdfWriter(temporary, first.layout, counts, compress=compress) as writer:
                 _copy(parts, writer, stop, by_name=compress)
-                # What was read has the checksums of the segments.
+                # The data read has the checksums of the segments.
                 k = 0
                 for segment, index in parts:
                     differing = np.argwhere(writer.checksums[k : k + len(index.counts)] != index.checksums)
@@ -330,7 +329,7 @@ def pack_segments(
 
 
 def _copy(segments: Segments, writer: VtkhdfWriter, stop: Callable[[], bool], *, by_name: bool) -> None:
-    """Copy all arrays of all segments, segment by segment, or array by array, which opens each segment more often."""
+    """Copy all arrays of all segments, by segment, or by array, which opens each segment once per array."""
     names = list(segments[0][1].layout.arrays)
     for group in [[name] for name in names] if by_name else [names]:
         for segment, index in segments:

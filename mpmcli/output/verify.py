@@ -1,4 +1,4 @@
-"""Whether a result has changed since it was written: every byte is read, and compared with its checksum."""
+"""Verifies a result: reads every byte and compares it with its checksum."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
@@ -31,7 +31,7 @@ from mpmcli.plain_text import counted
 
 @dataclass
 class Verification:
-    """Files and frames that were read, and a sentence for each fault."""
+    """Numbers of files and frames read, and a sentence for each fault."""
 
     path: Path
     files: int = 0
@@ -40,18 +40,18 @@ class Verification:
 
     @property
     def sound(self) -> bool:
-        """Whether nothing is wrong."""
+        """Whether there are no faults."""
         return not self.faults
 
     def add(self, other: "Verification") -> "Verification":
-        """Add what was found of one file more, and return that."""
+        """Add the outcome for another file, and return that outcome."""
         self.files += other.files
         self.frames += other.frames
         self.faults += other.faults
         return other
 
     def as_dict(self) -> dict:
-        """Return it as JSON can hold it."""
+        """Return it for JSON."""
         return {**asdict(self), "path": str(self.path), "ok": self.sound}
 
     def text(self) -> str:
@@ -62,7 +62,7 @@ class Verification:
 
 
 def verify_result(path: Path) -> Verification:
-    """Compare a result and all that lies beside it with its checksums; InputError: there is none of mpmcli."""
+    """Compare a result and its accompanying files with their checksums; InputError: no result of mpmcli."""
     path = result_place(path)
     found = Verification(path)
     directory = path if path.is_dir() else path.parent
@@ -86,7 +86,7 @@ def verify_result(path: Path) -> Verification:
             found.faults += faults
     if found.faults or not (path.is_dir() or path.name == PACKED):
         return found
-    # Compare scene.toml, and which colliders have files, with what the frames say of the scene.
+    # Compare scene.toml, and the set of collider files, with the scene stored with the frames.
     header, scene = open_result(directory).header, directory / SCENE
     text, colliders = header.stored.get("scene"), header.read_colliders({})
     if scene.exists() and text is not None:
@@ -100,9 +100,9 @@ def verify_result(path: Path) -> Verification:
 
 
 def verify_file(path: Path, *, frames: bool = True, stop: Callable[[], bool] = lambda: False) -> Verification:
-    """Compare all of a VTKHDF file with its checksums: of particles, or of colliders, which has no `frames` of ours.
+    """Compare a VTKHDF file with its checksums; `frames` is False for colliders.
 
-    KeyboardInterrupt: `stop` says so.
+    KeyboardInterrupt: `stop` returned True.
     """
     found = Verification(path, files=1)
     try:
@@ -124,7 +124,7 @@ def verify_file(path: Path, *, frames: bool = True, stop: Callable[[], bool] = l
 
 
 def _damaged_arrays(file: h5py.File, index: FrameIndex, stop: Callable[[], bool]) -> Iterator[tuple[int, str]]:
-    """Yield each frame with the name of an array that is not as it was written."""
+    """Yield each frame with the name of an array that has changed."""
     for column, name in enumerate(index.layout.arrays):
         found = FrameChecksums([name], index.counts)
         try:
@@ -140,7 +140,7 @@ def _damaged_arrays(file: h5py.File, index: FrameIndex, stop: Callable[[], bool]
 
 
 def _verify_count(directory: Path, files: Sequence[Path], counts: Sequence[int], found: Verification) -> None:
-    """Compare the numbers of the frames with their places, and with the record, which counts what was sealed."""
+    """Compare the numbers of the frames with their positions, and with the number of sealed frames in the record."""
     if found.faults:
         return
     written = (read_record(directory) or {}).get("frames_written")

@@ -36,14 +36,14 @@ from mpmcli.output.checksums import (
 )
 from mpmcli.output.layout import POSITION, FrameIndex, FrameLayout, ledger_columns, read_ledger
 
-# A newer upper bound makes files that no VTK can open ("bad version number for layout message").
+# A newer upper bound produces files that no VTK can open ("bad version number for layout message").
 LIBVER = ("v110", "v110")
 FORMAT = 2
 CHUNK_BYTES = 2**20
-# Size without the particles: headers, tables of the steps, ledger. Used to reserve disk space.
+# Size without particles: headers, tables of the steps, ledger. Used to reserve disk space.
 OVERHEAD_BYTES = 64 * 1024
 OVERHEAD_BYTES_PER_FRAME = 1024
-# What is copied at once stays in a cache of the processor.
+# Size of a copied block, which fits into a cache of the processor.
 BLOCK_BYTES = 2**20
 # The numbers of the particles of the largest frame, from 0 on.
 CONNECTIVITY = "Vertices/Connectivity"
@@ -62,7 +62,7 @@ def file_size(layout: FrameLayout, counts: Sequence[int]) -> int:
 
 
 def part_tables(counts: np.ndarray) -> dict[str, np.ndarray]:
-    """Return all under /VTKHDF but CONNECTIVITY that follows from (T,) particle counts: a part and a cell a frame."""
+    """Return the items of /VTKHDF, except CONNECTIVITY, that follow from (T,) particle counts: one cell per frame."""
     number = len(counts)
     cells = (counts > 0).astype(np.int64)
     zeros, cell_offsets = np.zeros(number, np.int64), np.zeros((number, 4), np.int64)
@@ -87,10 +87,11 @@ def part_tables(counts: np.ndarray) -> dict[str, np.ndarray]:
 
 
 class VtkhdfWriter:
-    """Write one file of T frames whose particle counts are known beforehand.
+    """Writes one file of T frames whose particle counts are known beforehand.
 
-    Arrays are contiguous, or with `compress` gzip-1 with shuffle, the one filter that every VTK has, in chunks of about
-    1 MiB. Bytes depend on content alone, if arrays are written from first frame to last, compressed ones in turn.
+    Arrays are contiguous; with `compress` they use gzip-1 with shuffle, the only filter of every VTK, in chunks of
+    about 1 MiB. The bytes depend on the content alone if each array is written from the first frame to the last, and
+    compressed arrays one after the other.
     """
 
     def __init__(self, path: Path, layout: FrameLayout, counts: Sequence[int], *, compress: bool = False) -> None:
@@ -98,13 +99,13 @@ class VtkhdfWriter:
         self._counts = np.asarray(counts, dtype=np.int64)
         self._compress = compress
         self._checksums = FrameChecksums(layout.arrays, self._counts)
-        # Rows of each array that were written.
+        # Number of rows written of each array.
         self._rows = dict.fromkeys(layout.arrays, 0)
-        # Of compressed arrays, rows that do not fill a chunk yet.
+        # For compressed arrays, rows that do not yet fill a chunk.
         self._waiting: dict[str, np.ndarray] = {}
         self._path, self._finished = path, False
         self._file = h5py.File(path, "w", libver=LIBVER, locking="best-effort", rdcc_nbytes=8 * CHUNK_BYTES)
-        # Checksums of all items but the arrays of the frames, noted as they are written.
+        # Checksums of all items except the arrays of the frames, recorded as they are written.
         self._items: dict[str, int] = {}
         root = self._file.create_group("VTKHDF")
         self._put_attribute("VTKHDF", "Version", np.array([2, 0]))
@@ -119,7 +120,7 @@ class VtkhdfWriter:
             self._items[f"VTKHDF/{array_path(name)}"] = kind_checksum(np.dtype(array.dtype), shape)
         for name, table in part_tables(self._counts).items():
             self._put(f"VTKHDF/{name}", table)
-        # The numbers of the particles, all at once where they are compressed, as chunks may not be divided.
+        # The numbers of the particles, written at once if compressed, because chunks cannot be divided.
         n, path = int(self._counts.max()), f"VTKHDF/{CONNECTIVITY}"
         size = max(1, n if compress else BLOCK_BYTES // 8)
         data = self._file.create_dataset(path, (n,), np.int64, **self._storage((n,), 8))
@@ -136,7 +137,7 @@ class VtkhdfWriter:
         self.close()
 
     def close(self) -> None:
-        """Close the file; one that was not finished is of no use."""
+        """Close the file; an unfinished file is unusable."""
         if not self._file:
             return
         gaps = gaps_of(list(self._datasets.values())) if self._finished else []
@@ -145,7 +146,7 @@ class VtkhdfWriter:
             append_checksum(self._path, gaps)
 
     def append(self, name: str, stored: np.ndarray) -> None:
-        """Write the next rows of an array, of parts of a frame or of several, as `ArrayLayout.pad` gives them."""
+        """Write the next rows of an array, part of a frame or several frames, as returned by `ArrayLayout.pad`."""
         data, first = self._datasets[name], self._rows[name]
         rows = np.ascontiguousarray(stored, data.dtype)
         self._rows[name] = end = first + len(rows)
@@ -153,7 +154,7 @@ class VtkhdfWriter:
         if data.chunks is None:
             data[first:end] = rows
             return
-        # Whole chunks, each at once; those of the last rows of the array whole or not.
+        # Write whole chunks, each at once; the last chunk of the array may be partial.
         if name in self._waiting:
             rows = np.concatenate([self._waiting.pop(name), rows])
         first, size = end - len(rows), data.chunks[0]
@@ -165,7 +166,7 @@ class VtkhdfWriter:
 
     @property
     def checksums(self) -> np.ndarray:
-        """Those of the frames written so far, (T, arrays of the layout) uint32."""
+        """Checksums of the frames written so far, (T, arrays of the layout) uint32."""
         return self._checksums.table
 
     def finish(
@@ -176,7 +177,7 @@ class VtkhdfWriter:
         rows: Sequence[LedgerRow],
         header: dict,
     ) -> None:
-        """Write what describes the frames, once, after the last array; the scene of the header becomes an attribute."""
+        """Write the description of the frames, once, after the last array; the header's scene becomes an attribute."""
         for name, column in ledger_columns(rows).items():
             self._put(f"ledger/{name}", column)
         self._put("mpmcli/frame", np.asarray(frames, dtype=np.int64))
@@ -208,7 +209,7 @@ class VtkhdfWriter:
     def _storage(self, shape: tuple[int, ...], row_bytes: int) -> dict:
         if not self._compress or shape[0] == 0:
             return {}
-        # A chunk holds whole frames, or a whole number of chunks makes a frame, when counts are equal.
+        # With equal counts, a chunk contains whole frames, or a frame is a whole number of chunks.
         rows, n = max(1, CHUNK_BYTES // row_bytes), max(1, int(self._counts.max()))
         chunk = n * (rows // n) if rows >= n else -(-n // -(-n // rows))
         return {
@@ -221,7 +222,7 @@ class VtkhdfWriter:
 
 @contextmanager
 def open_vtkhdf(path: Path) -> Iterator[h5py.File]:
-    """Open a sealed file for reading as `opened` does; InputError, too: it is not of mpmcli, or of another format."""
+    """Open a sealed file for reading as `opened` does; InputError: it is not of mpmcli, or of another format."""
     with opened(path, "a particles.vtkhdf of mpmcli or its directory") as file:
         if "mpmcli" not in file or "VTKHDF" not in file:
             raise InputError(f"{path} is an HDF5 file, but mpmcli did not write it: its group /mpmcli is missing.")
@@ -230,7 +231,7 @@ def open_vtkhdf(path: Path) -> Iterator[h5py.File]:
 
 
 def read_index(file: h5py.File) -> FrameIndex:
-    """Read everything but the particles; DamageError where a checksum differs, else errors of h5py and ValueError."""
+    """Read everything except particles; DamageError: a checksum differs; errors of h5py or ValueError: other faults."""
     checksums = load_checksums(file, "mpmcli")
 
     def table(path: str) -> np.ndarray:
@@ -268,7 +269,7 @@ def read_index_of(path: Path) -> FrameIndex:
 
 
 def read_blocks(file: h5py.File, name: str, count: int) -> Iterator[np.ndarray]:
-    """Yield the first rows of one array, in the form of the file, BLOCK_BYTES at a time; no checksum is compared."""
+    """Yield the first rows of an array, in the form in the file, BLOCK_BYTES at a time; no checksum is compared."""
     data = file[f"VTKHDF/{array_path(name)}"]
     size = max(1, BLOCK_BYTES * len(data) // max(1, data.nbytes))
     for first in range(0, count, size):

@@ -1,4 +1,4 @@
-"""Colliders in pictures: flat in the plane, meshes in space, and the mirror images of particles behind them."""
+"""Colliders in pictures: flat in 2D, meshes in 3D, and the mirror images of particles behind them."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,18 +18,18 @@ from mpmcli.scene.surface import Surface, collider_surface, poly_data, surface_o
 if TYPE_CHECKING:
     import pyvista as pv
 
-RIM, DARKER = 2.0, 0.35  # pixels of a dark rim, at a picture 720 pixels high, and by which share it is darker
-FILLED = 0.55  # share of the colour of colliders that their inside has, the rest being the ground
+RIM, DARKER = 2.0, 0.35  # pixels of a dark rim in a picture 720 pixels high, and the fraction by which it is darker
+FILLED = 0.55  # fraction of the collider colour in the interior; the rest is the background
 SHARP = 30.0  # angle between triangles, degrees, from which on an edge is sharp
-FINE = 1 / 60  # edges of triangles that carry light, as a share of the longest side of the domain
-THICK = 1 / 88  # thickness of the layer under a surface that takes light, in the same measure
-LINE, DARK = 1.5, 0.55  # pixels, at a picture 720 pixels high, and brightness of the lines along edges
+FINE = 1 / 60  # edges of triangles that carry light, as a fraction of the longest side of the domain
+THICK = 1 / 88  # thickness of the layer under a surface that absorbs light, in the same unit
+LINE, DARK = 1.5, 0.55  # width in pixels, in a picture 720 pixels high, and brightness of the lines along edges
 NEAR = 2.0  # distance from a collider within which a particle has an image, in distances between particles
-# Most by which the mirror is before the collider, in the same measure: bodies are kept about a distance from it.
+# Largest distance of the mirror in front of the collider, in the same unit: bodies stay about that distance away.
 BEFORE = 0.75
-# Depth behind an image that is inside of the collider too, in the same measure: no image is seen beyond a thin one.
+# Depth behind an image that must be inside the collider, in the same unit, so that no image appears beyond a thin one.
 BEHIND = 2.0
-STEP = 1e-3  # step of differences, in the same measure
+STEP = 1e-3  # step of finite differences, in the same unit
 
 
 class FlatColliders:
@@ -45,7 +45,7 @@ class FlatColliders:
 
     @cached_property
     def _inside(self) -> np.ndarray:
-        """The share of each pixel that lies in the domain, (h, w)."""
+        """The fraction of each pixel that lies in the domain, (h, w)."""
         low, high = np.sort(self._view.pixels(self._plane.corners(self._scene))[:, :2], axis=0)
         shares = (np.minimum(a - low[k], high[k] - a) + 0.5 for k, a in enumerate(self._middles))
         across, up = (np.clip(share, 0.0, 1.0) for share in shares)
@@ -53,7 +53,7 @@ class FlatColliders:
 
     @cached_property
     def _points(self) -> np.ndarray:
-        """The points of the plane in the middles of the pixels, (h, w, 3), m."""
+        """The points of the plane at the centres of the pixels, (h, w, 3), m."""
         x, y = self._middles
         points = self._view.rays(x[None, :], y[:, None])[0]
         if self._plane.normal is not None:
@@ -61,7 +61,7 @@ class FlatColliders:
         return points
 
     def draw(self, picture: np.ndarray, frame: Frame, free: np.ndarray | float = 1.0) -> None:
-        """Draw the colliders of a frame over a picture (h, w, 3) from 0 to 1, in the `free` share (h, w) of pixels."""
+        """Draw the colliders of a frame over a picture (h, w, 3) from 0 to 1, in the `free` part (h, w) of pixels."""
         shown = [(k, it) for k, it in enumerate(self._scene.colliders) if self._scene.shows(k, frame)]
         if shown:
             depth = np.max([self._depth(number, collider, frame.time) for number, collider in shown], axis=0)
@@ -70,7 +70,7 @@ class FlatColliders:
             picture += cover[..., None] * (self._fill + rim * (self._dark - self._fill) - picture)
 
     def _depth(self, number: int, collider: Collider, time: float) -> np.ndarray:
-        """Return how many pixels (h, w) each pixel lies inside a collider, negative outside."""
+        """Return the depth in pixels of each pixel inside a collider, (h, w), negative outside."""
         if number in self._kept:
             return self._kept[number]
         place = self._near(collider, time)
@@ -84,7 +84,7 @@ class FlatColliders:
         return depth
 
     def _near(self, collider: Collider, time: float) -> tuple[slice, slice]:
-        """Return rows and columns of the picture that a collider may be seen in."""
+        """Return rows and columns of the picture in which a collider may be visible."""
         if isinstance(collider.form, Plane) or collider.side == "inside":
             return slice(None), slice(None)
         corners = np.array(list(product(*zip(*collider.form.bounds(), strict=True))))
@@ -98,26 +98,26 @@ class FlatColliders:
 
 @dataclass(frozen=True, eq=False)
 class ColliderMesh:
-    """The surface of one collider where its shape stands, as triangles fine enough for light and shadow."""
+    """The surface of one collider at its shape, as triangles fine enough for light and shadow."""
 
     collider: Collider
     number: int  # of the collider in the scene
-    surface: Surface  # triangles with the material before them
+    surface: Surface  # triangles with the material in front of them
     side: float  # longest side of the domain, m
 
     @property
     def casts(self) -> bool:
-        """Whether it throws shadows: the ground and containers do not."""
+        """Whether it casts shadows: the ground and containers do not."""
         return self.collider.side == "outside" and not isinstance(self.collider.form, Plane)
 
     def transform(self, time: float) -> np.ndarray:
-        """Return the matrix (4, 4) that takes points, counted from the pivot, to where they are at a time, s."""
+        """Return the matrix (4, 4) that maps points, relative to the pivot, to their positions at a time, s."""
         matrix = np.eye(4)
         matrix[:3, 3], matrix[:3, :3] = self.collider.motion.pose(time)
         return matrix
 
     def shown(self, *, fine: bool = False) -> Any:
-        """Return PyVista's mesh, counted from the pivot, normals parted by sharp edges, long edges divided if fine."""
+        """Return PyVista's mesh relative to the pivot, normals split at sharp edges, long edges divided if fine."""
         return self._from_pivot(self._fine if fine else self.surface).compute_normals(
             cell_normals=False,
             split_vertices=True,
@@ -127,7 +127,7 @@ class ColliderMesh:
         )
 
     def edges(self) -> Any:
-        """Return its sharp edges and its rims as PyVista's lines, counted from the pivot."""
+        """Return its sharp edges and its rims as PyVista's lines relative to the pivot."""
         return self._from_pivot(self.surface).extract_feature_edges(
             SHARP, boundary_edges=True, non_manifold_edges=False, feature_edges=True, manifold_edges=False
         )
@@ -136,7 +136,7 @@ class ColliderMesh:
         return poly_data(Surface(surface.points - np.array(self.collider.motion.pivot), surface.cells))
 
     def shade(self, time: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return places (n, 3) under its surface that take light at a time, s, and their volumes (n,), m^3."""
+        """Return points (n, 3) under its surface that absorb light at a time, s, and their volumes (n,), m^3."""
         places, volumes = self._lit
         return self.collider.motion.placed(places, time), volumes
 
@@ -158,7 +158,7 @@ class ColliderMesh:
 
 
 def collider_meshes(scene: RenderScene) -> tuple[ColliderMesh, ...]:
-    """Return the surfaces of the colliders of a 3D scene that have any extent in it."""
+    """Return the surfaces of the colliders with an extent in a 3D scene."""
     lower, upper = np.array(scene.lower), np.array(scene.upper)
     side = float(np.max(upper - lower))
     surfaces = [collider_surface(collider, lower, upper) for collider in scene.colliders]
@@ -172,9 +172,9 @@ def collider_meshes(scene: RenderScene) -> tuple[ColliderMesh, ...]:
 
 
 def _cut_open(surface: Surface, towards: tuple[float, ...]) -> Surface:
-    """Return what of a closed surface lies behind the plane through its middle that faces a direction, closed there.
+    """Return the part of a closed surface behind the plane through its middle that faces a direction, closed there.
 
-    An open one, as the domain cuts it off, stays as it is.
+    A surface that the domain cuts open stays as it is.
     """
     data = poly_data(surface)
     if not len(surface.cells) or data.n_open_edges:
@@ -184,7 +184,7 @@ def _cut_open(surface: Surface, towards: tuple[float, ...]) -> Surface:
 
 
 class ColliderActors:
-    """Shaded surfaces in a window, seen from the side that faces the material: so a container hides nothing in it."""
+    """Shaded surfaces in a window, visible from the side of the material, so that a container hides no content."""
 
     def __init__(self, scene: RenderScene, theme: Theme, window: OffscreenRenderer) -> None:
         self._scene = scene
@@ -202,13 +202,13 @@ class ColliderActors:
                 specular=0.0,
                 reset_camera=False,
             )
-            # A line on the surface is in front of it.
+            # Draw lines on the surface in front of it.
             surface.mapper.SetResolveCoincidentTopologyToPolygonOffset()
             surface.mapper.SetRelativeCoincidentTopologyPolygonOffsetParameters(1.0, 1.0)
             self._actors.append((mesh, [surface, *edge_actors(mesh, theme, window)]))
 
     def pose(self, frame: Frame) -> None:
-        """Put those of a frame where they are."""
+        """Move the colliders of a frame to their positions."""
         self._shown = [(mesh, actors) for mesh, actors in self._actors if self._scene.shows(mesh.number, frame)]
         for mesh, actors in self._actors:
             shown, matrix = self._scene.shows(mesh.number, frame), mesh.transform(frame.time)
@@ -216,11 +216,11 @@ class ColliderActors:
                 actor.visibility, actor.user_matrix = shown, matrix
 
     def shades(self, time: float) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return what they take of the light at a time, s; see `ColliderMesh.shade`."""
+        """Return the points that absorb light at a time, s; see `ColliderMesh.shade`."""
         return [mesh.shade(time) for mesh, _ in self._shown if mesh.casts]
 
     def depth_without(self, window: OffscreenRenderer) -> np.ndarray:
-        """Return the depth of a picture of everything else, as `OffscreenRenderer.depth`; the window shows it then."""
+        """Return the depth of a picture without colliders, as `OffscreenRenderer.depth`; the window then shows it."""
         for show in (False, True):
             for _, actors in self._shown:
                 for actor in actors:
@@ -259,7 +259,7 @@ def _images(position: np.ndarray, distance: float, collider: Collider, time: flo
         ],
         axis=1,
     ) / (2 * step)
-    # As far from its image as from another particle, where the mirror may be as far before the collider.
+    # A particle is as far from its image as from another particle, if the mirror may be that far in front.
     mirror = np.clip(away - 0.5 * distance, 0.0, BEFORE * distance)
     images = points - 2 * (away - mirror) * normal
     thick = collider.signed_distance(images - BEHIND * distance * normal, time) < 0

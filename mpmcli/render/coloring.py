@@ -44,14 +44,14 @@ class Coloring:
     """Colours by value."""
 
     name: str
-    unit: str  # "" where there is none
-    fields: tuple[str, ...]  # to be read of each frame
-    value: Callable[[Frame], np.ndarray]  # gives (n,) float64 for a frame; NaN where there is none
+    unit: str  # "" if there is none
+    fields: tuple[str, ...]  # fields to read of each frame
+    value: Callable[[Frame], np.ndarray]  # returns (n,) float64 for a frame; NaN if missing
     cmap: str = SEQUENTIAL  # name of a colour map of matplotlib
     limits: tuple[float, float] = (0.0, 1.0)  # the values at its two ends, the same for all frames
-    missing: str = ""  # "#rrggbb" of what is not a number
-    middle: float | None = None  # the neutral value, where there is one
-    floor: float | None = None  # the least value, where there is one
+    missing: str = ""  # "#rrggbb" of missing values
+    middle: float | None = None  # the neutral value, if there is one
+    floor: float | None = None  # the smallest value, if there is one
 
     def values(self, frame: Frame) -> np.ndarray:
         """Return (n,) float64; a quotient by zero is a missing value."""
@@ -69,7 +69,7 @@ class Coloring:
         low, high = self.limits
         with np.errstate(all="ignore"):
             share = np.where(np.isfinite(values), (values - low) / (high - low), np.nan)
-        # Matplotlib takes what is not a number as bad.
+        # Matplotlib treats nan as bad.
         return mpl.colormaps[self.cmap].with_extremes(bad=self.missing)(share, bytes=True)[..., :3]
 
 
@@ -159,7 +159,7 @@ def _field(name: str, result: Result) -> Coloring:
         if width == 1:
             return Coloring(plain, unit, fields, lambda frame: array(frame)[:, 0])
         return Coloring(f"|{plain}|", unit, fields, lambda frame: np.linalg.norm(array(frame), axis=1), floor=0.0)
-    # In 2D the stress has all three axes, and so may other fields.
+    # In 2D the stress has three axes, and so may other fields.
     known = next((list(AXES[:n]) for n in (2, 3) if width == n), [])
     known = next(([a + b for a in AXES[:n] for b in AXES[:n]] for n in (2, 3) if width == n * n), known)
     if component not in known:
@@ -196,7 +196,7 @@ def _limits(value: Coloring, result: Result) -> tuple[float, float]:
         reach = max(abs(high - value.middle), abs(low - value.middle))
         low, high = value.middle - reach, value.middle + reach
     if high - low <= max(1e-6 * max(abs(low), abs(high)), LIMIT_MIN):
-        # A constant value gets the middle of the map, however it is rounded.
+        # A constant value gets the middle of the map, whatever its rounding.
         reach = 0.05 * max(abs(low), abs(high))
         reach = reach if reach > LIMIT_MIN else 1.0
         low, high = low - reach * (value.floor is None), high + reach
@@ -204,7 +204,7 @@ def _limits(value: Coloring, result: Result) -> tuple[float, float]:
 
 
 def color_map(name: str | None, usual: str = SEQUENTIAL) -> str:
-    """Return the name of a colour map, the usual one for None; raise InputError where matplotlib has no such map."""
+    """Return the name of a colour map, the usual one for None; InputError: matplotlib has no such map."""
     import matplotlib as mpl
 
     if name is None:
@@ -212,7 +212,7 @@ def color_map(name: str | None, usual: str = SEQUENTIAL) -> str:
     if name not in mpl.colormaps:
         guess = nearest(name, list(mpl.colormaps))
         hint = f'did you mean "{guess}"?' if guess else "viridis, cividis, magma, coolwarm are some."
-        raise InputError(f'--cmap "{name}" is no colour map of matplotlib; {hint}')
+        raise InputError(f'--cmap "{name}" is not a colour map of matplotlib; {hint}')
     return name
 
 
@@ -221,7 +221,7 @@ def _scalar(frame: Frame, field: str) -> np.ndarray:
 
 
 def _von_mises(stress: np.ndarray) -> np.ndarray:
-    """Return sqrt(3/2 s : s), s the deviator of the stress (n, 3, 3), or of that in the plane (n, 2, 2)."""
+    """Return sqrt(3/2 s : s), s the deviator of the stress (n, 3, 3), or of the in-plane stress (n, 2, 2)."""
     d = stress.shape[1] if stress.ndim == 3 else round(stress.shape[1] ** 0.5)
     tensor = np.asarray(stress, dtype=np.float64).reshape(len(stress), d, d)
     deviator = tensor - np.trace(tensor, axis1=1, axis2=2)[:, None, None] / d * np.eye(d)

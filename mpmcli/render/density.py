@@ -64,7 +64,7 @@ def density_colors(
     """Return the colouring of a density; by default at most 1 % of the nodes with mass exceed the upper limit."""
     if result.header.drops:
         raise InputError(
-            f"{result.path} holds only particles that are there (output.drop_retired), which do not say their masses: "
+            f"{result.path} holds only the particles present (output.drop_retired), from which masses do not follow: "
             "density needs all of them; run the scene without it, or choose another --mode."
         )
     if limits is None:
@@ -78,7 +78,7 @@ def density_colors(
 
 
 class DensityPainter:
-    """Draws the density of the grid in a plane, which fades out where there is little."""
+    """Draws the density of the grid in a plane; small values fade into the background."""
 
     fields: tuple[str, ...] = ()
 

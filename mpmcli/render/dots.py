@@ -17,18 +17,18 @@ from mpmcli.render.view import Slice, View
 if TYPE_CHECKING:
     import pyvista as pv
 
-# Diameter of a dot over the distance between particles: neighbours overlap a little, so that a body looks whole.
+# Diameter of a dot over the distance between particles: neighbours overlap slightly, so that a body looks continuous.
 OVERLAP = 1.15
 SMALLEST = 1.5  # smallest diameter of a dot, pixels, so that a single particle is visible
 SMOOTHED = 400_000  # up to this number of particles, each pixel is the average of four, which makes round edges smooth
 DOT_MAX = 255  # largest diameter of a dot that is drawn, pixels
-# Logarithm of the ratio of the sizes in which dots are drawn, in perspective and in parallel, where they are few.
+# Logarithm of the ratio of consecutive dot sizes, in perspective and in parallel views, which have few sizes.
 LEVEL, FINE_LEVEL = 0.04, 1e-4
-FARTHEST = 16  # maximum number of squares on each side in which dots that hide another are sought
+FARTHEST = 16  # maximum number of squares on each side that are searched for dots that hide another
 STRENGTH = 0.55  # fraction of the light that a deep gap absorbs
 DEEP = 4.0  # depth of a deep gap, in diameters of a dot
 REACH = 1.2  # distance of the compared pixels, in diameters of a dot
-MOST = 1.5  # upper bound of a gap, in units of `DEEP`: what is farther away is another body
+MOST = 1.5  # upper bound of a gap, in units of `DEEP`: anything farther away is another body
 DIRECTIONS = ((1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1))
 
 
@@ -51,7 +51,7 @@ class DotsPainter:
             self._colliders = ColliderActors(scene, theme, self._offscreen)
 
     def draw(self, frame: Frame) -> np.ndarray:
-        """Return (h, w, 3) uint8; particles without a place are left out."""
+        """Return (h, w, 3) uint8; particles without a position are left out."""
         placed = np.isfinite(frame.position).all(axis=1)
         points = np.zeros((int(placed.sum()), 3))
         points[:, : self._scene.dimension] = frame.position[placed]
@@ -77,7 +77,7 @@ class DotsPainter:
         if self._flat:
             if self._ground is None:
                 return picture
-            # Colliders are between the dots: what lies in a collider is not hidden by it.
+            # Colliders are drawn between the dots and do not hide particles inside them.
             free = _blocks(~np.isfinite(self._offscreen.depth()), self._offscreen.samples)
             image = picture / np.float32(255)
             self._ground.draw(image, frame, free.mean(axis=(1, 3), dtype=np.float32))
@@ -88,7 +88,7 @@ class DotsPainter:
         return depth_shaded(picture, depth, float(self._diameters.max()), self._view, self._offscreen.samples, others)
 
     def _hidden(self, points: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-        """Return which dots are wholly covered by others, (n,) bool: leaving them out changes no pixel."""
+        """Return which dots are fully covered by others, (n,) bool: their omission changes no pixel."""
         pixels = self._view.pixels(points)
         inside = (pixels[:, :2] >= 0).all(axis=1) & (pixels[:, :2] < self._view.size).all(axis=1) & (pixels[:, 2] > 0)
         result = np.zeros(len(points), dtype=bool)
@@ -97,7 +97,7 @@ class DotsPainter:
         side = (0.5 * float(sizes.min()) - edge) / math.sqrt(8.0)
         if side >= 0.5 * edge and inside.any():
             reach = math.ceil((0.5 * float(sizes[inside].max()) + edge) / side)
-            # For a camera among the dots, comparing takes longer than drawing.
+            # For a camera among the dots, the comparison takes longer than drawing.
             if reach <= FARTHEST:
                 result[inside] = hidden(pixels[inside], side, float(self._diameters.max()), reach, cover=1)
         return result
@@ -109,7 +109,7 @@ class DotsPainter:
         cloud = pv.PolyData((points - self._corner).astype(np.float32))
         cloud["rgb"] = colors
         if level not in self._actors:
-            # Flat dots have exactly the colours of the colour bar.
+            # Flat dots have the exact colours of the colour bar.
             self._actors[level] = self._offscreen.add_dots(cloud, lit=not self._flat)
             self._actors[level].position = tuple(self._corner.tolist())
             self._actors[level].prop.point_size = size * self._offscreen.samples
@@ -118,7 +118,7 @@ class DotsPainter:
 
 
 def samples_of(size: tuple[int, int], count: int, largest: float) -> int:
-    """Return the samples along each axis of a pixel, by the number of dots and the widest one."""
+    """Return the samples along each axis of a pixel, from the number of dots and the widest one."""
     possible = 2 * max(size) <= SIDE_MAX and 4 * size[0] * size[1] <= PIXELS_MAX and 2 * largest <= DOT_MAX
     return 2 if possible and count <= SMOOTHED else 1
 
@@ -131,13 +131,13 @@ def _blocks(values: np.ndarray, samples: int) -> np.ndarray:
 def depth_shaded(
     picture: np.ndarray, depth: np.ndarray, diameter: float, view: View, samples: int, dots: np.ndarray | None = None
 ) -> np.ndarray:
-    """Darken what lies deeper than its surroundings (eye-dome lighting, C. Boucheny, PhD thesis, Grenoble 2009).
+    """Darken pixels deeper than their surroundings (eye-dome lighting, C. Boucheny, PhD thesis, Grenoble 2009).
 
-    VTK's eye-dome lighting and SSAO were compared with it, and take three to five times as long.
-    The picture is (h, w, 3) uint8, the depth (h * samples, w * samples), m, inf where there is nothing; `dots` is the
-    depth of what is compared, where there is more in the picture: the rest is not darkened.
+    VTK's eye-dome lighting and SSAO were compared with it, and take three to five times as long. The picture is (h, w,
+    3) uint8, the depth (h * samples, w * samples), m, inf for the background; `dots` is the depth of the dots alone if
+    the picture has other objects, which are not darkened.
     """
-    # The nearest of the samples of a pixel: its edges belong to what is in front.
+    # The nearest sample of a pixel, because an edge belongs to the object in front.
     width, height = view.size
     nearest = first = _blocks(depth, samples).min(axis=(1, 3))
     if dots is not None:
@@ -145,7 +145,7 @@ def depth_shaded(
     solid = np.isfinite(nearest)
     if not solid.any():
         return picture
-    # From very near a dot is larger than the picture.
+    # At a very small distance a dot is larger than the picture.
     reach = max(1, min(round(REACH * diameter * view.pixels_per_metre), max(view.size)))
     bare = np.where(solid, nearest, np.float32(view.far))
     padded = np.pad(bare, reach, mode="edge")
@@ -159,10 +159,10 @@ def depth_shaded(
 
 
 def hidden(pixels: np.ndarray, cell: float, gap: float, reach: int = 1, cover: int = 0) -> np.ndarray:
-    """Return which particles are invisible (n,): others, nearer by `gap`, m, cover every square they may be seen in.
+    """Return which particles are invisible (n,): others, nearer by `gap`, m, cover all squares of their dots.
 
     `pixels` are (n, 3), from the left and from the top, and the distance, m; squares of side `cell`, pixels, are
-    compared. `reach` and `cover` are squares on each side of its own that a particle may be seen in, and covers whole.
+    compared. `reach` and `cover` are the squares on each side of its own that a particle may touch, and fully covers.
     """
     if len(pixels) == 0:
         return np.zeros(0, dtype=bool)

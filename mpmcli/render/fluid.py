@@ -1,4 +1,4 @@
-"""Liquids as bodies with a surface, drawn from the picture of their particles; everything else as dots.
+"""Draws liquids as bodies with a surface, found in screen space, and all other particles as dots.
 
 Screen-space fluid rendering: W. J. van der Laan, S. Green and M. Sainz, "Screen space fluid rendering with curvature
 flow", Proc. I3D 2009, 91-98, with another smoothing, see `liquid_surface.smoothed`.
@@ -25,16 +25,16 @@ if TYPE_CHECKING:
     import pyvista as pv
 
 TONE = 0.05  # largest deviation of the brightness of a dot, up or down, which makes neighbours distinguishable
-# What is behind a surface by less than this, in distances between particles, lies on it, as the edges of the domain do.
+# Objects less than this behind a surface, in distances between particles, lie on it, like the edges of the domain.
 LIES_ON = 0.3
-FALLS_THROUGH = 0.5  # share of the shadow on the floor that is not seen through a liquid
-LEAVES_TRACES = 4.0  # distance from a particle to which it changes the picture, in distances between particles
-BENDS = 0.3  # the most of a liquid that bends what lies behind it, in lengths of the scene
-SAMPLES = 2  # samples along each axis of a pixel in what VTK draws
+FALLS_THROUGH = 0.5  # fraction of the shadow on the floor that is not visible through a liquid
+LEAVES_TRACES = 4.0  # distance up to which a particle changes the picture, in distances between particles
+BENDS = 0.3  # largest thickness of a liquid that refracts the background, in lengths of the scene
+SAMPLES = 2  # samples along each axis of a pixel in VTK's pictures
 HEAD_ON = 0.02  # reflectance of water at normal incidence: ((n - 1) / (n + 1))^2, n = 1.33
-SKIN = 0.05  # a skin of this thickness, in lengths of the scene, is added to every liquid: a film of it is seen
-RIM = 0.35  # light that comes from behind is lost at the rim, where it would leave at a grazing angle
-LINEAR = (np.arange(256, dtype=np.float32) / 255) ** np.float32(2.2)  # displayed values as amounts of light
+SKIN = 0.05  # a skin of this thickness, in lengths of the scene, is added to every liquid, so that films are visible
+RIM = 0.35  # light from behind is lost at the rim, where it would leave at a grazing angle
+LINEAR = (np.arange(256, dtype=np.float32) / 255) ** np.float32(2.2)  # displayed values in linear light
 
 
 class FluidPainter:
@@ -45,7 +45,7 @@ class FluidPainter:
     def __init__(self, scene: RenderScene, view: View, theme: Theme) -> None:
         self._scene, self._view = scene, view
         extent = np.subtract(scene.upper, scene.lower)
-        # Absorption scales with the size of the scene: a beaker and a reservoir look alike.
+        # Absorption scales with the size of the scene, so that a beaker and a reservoir look alike.
         self._length = float(np.cbrt(np.prod(np.maximum(extent, 1e-3 * extent.max()))))
         self._lamp = lights_of(scene, view, theme)["lampTo"]
         floor, directions = linear(theme.floor), (view.axes @ self._lamp, view.axes @ np.array(scene.up))
@@ -69,7 +69,7 @@ class FluidPainter:
         picture, depth, shade = self._things([group for group in groups if not group.appearance.liquid], frame)
         occlusion = occlusion_by(self._scene, groups, self._lamp, self._colliders.shades(frame.time))
         image = LINEAR[self._background.image(occlusion)]
-        # What each sample of the pixels shows: its light, and its distance.
+        # The light and the distance of each sample of the pixels.
         places = list(np.ndindex(SAMPLES, SAMPLES))
         samples = [
             (LINEAR[picture[i::SAMPLES, j::SAMPLES]] * shade, depth[i::SAMPLES, j::SAMPLES, None]) for i, j in places
@@ -86,7 +86,7 @@ class FluidPainter:
             front[place][..., 0] = np.where(surface.alpha > 0, surface.depth, NOTHING)[part]
             front += np.float32(LIES_ON * min(liquid.distance for liquid in liquids))
             cover[place][..., 0] = surface.alpha[part]
-            # Part of the light that a liquid takes from the floor beside it falls through it on the floor under it.
+            # Part of the light that a liquid blocks passes through it to the floor below.
             floor = image + np.float32(FALLS_THROUGH) * (self._bare - image)
             behind = _mean([np.where(np.isfinite(far) & (far >= front), light, floor) for light, far in samples])
             wet = np.zeros_like(image)
@@ -100,7 +100,7 @@ class FluidPainter:
     def _things(self, groups: list[Group], frame: Frame) -> tuple[np.ndarray, ...]:
         """Draw lines, colliders and the groups as dots.
 
-        Returned are the picture (2h, 2w, 3) uint8, the depth, inf where there is nothing, and the share of light left.
+        Returns the picture (2h, 2w, 3) uint8, the depth, inf for the background, and the fraction of light left.
         """
         for actor in self._actors.values():
             actor.SetVisibility(False)
@@ -118,7 +118,7 @@ class FluidPainter:
         return picture, depth, shade
 
     def _show(self, group: Group) -> None:
-        """Let the next picture show the dots of a group, each a little lighter or darker."""
+        """Show the dots of a group in the next picture, each slightly lighter or darker."""
         import pyvista as pv
 
         cloud = pv.PolyData(group.position.astype(np.float32))
@@ -130,13 +130,13 @@ class FluidPainter:
         actor = self._actors[group.key]
         actor.mapper.dataset = cloud
         actor.SetVisibility(True)
-        # Dots of one group have one size, that of those in the middle.
+        # All dots of a group have the size of those in its middle.
         distance = max(float(np.median(self._view.pixels(group.position)[:, 2])), self._view.near)
         size = OVERLAP * group.distance * float(self._view.scale_at(np.array(distance)))
         actor.prop.point_size = max(size, SMALLEST) * SAMPLES
 
     def _liquid(self, group: Group, frame: Frame) -> Liquid:
-        """Return those particles of a liquid that may be seen."""
+        """Return the particles of a liquid that may be visible."""
         view = self._view
         pixels = view.pixels(group.position)
         seen = np.flatnonzero(pixels[:, 2] > max(view.near, 2 * group.distance))
@@ -149,7 +149,7 @@ class FluidPainter:
         return Liquid(group.appearance, group.distance, group.position[seen], pixels[seen], scale, volume)
 
     def _lit(self, surface: Surface, layers: list[tuple[Liquid, np.ndarray]], behind: np.ndarray) -> np.ndarray:
-        """Return the light (h, w, 3) of the pixels of the window that the liquids cover."""
+        """Return the light (h, w, 3) of the pixels of the window covered by liquids."""
         window, view = surface.window, self._view
         height, width = behind.shape[:2]
         row, column = np.nonzero(surface.alpha > 0)
@@ -188,15 +188,15 @@ def _mean(images: list[np.ndarray]) -> np.ndarray:
 class Optics:
     """Optical properties of a liquid."""
 
-    depths: float  # optical depths (natural logarithms) that the deepest colour loses over the length of the scene
-    milk: float  # optical depths that it scatters back, in all colours alike
-    body: float  # share of the light that what is scattered gives back
-    deepening: float  # power of the share let through by which what is scattered deepens, its way being as coloured
-    gloss: float  # how strong highlights are
+    depths: float  # optical depth (natural logarithm) of the most absorbed colour over the length of the scene
+    milk: float  # optical depth of scattering, equal for all colours
+    body: float  # fraction of the scattered light that returns
+    deepening: float  # exponent of the transmitted fraction that tints the scattered light
+    gloss: float  # strength of highlights
     sharpness: float  # exponent of the highlight
-    reflection: float  # share of the mirror image that is kept; 0 is dull
-    bend: float  # how far what lies behind is shifted, in parts of the thickness
-    glow: float = 0.0  # light of its own, in parts of full white
+    reflection: float  # fraction of the mirror image that is kept; 0 is dull
+    bend: float  # shift of the background by refraction, as a fraction of the thickness
+    glow: float = 0.0  # emitted light, as a fraction of full white
 
 
 # Depths, milk, body, deepening, gloss, sharpness, reflection, bend, glow.
@@ -217,7 +217,7 @@ def optics_of(appearance: Appearance) -> Optics:
 
 @dataclass(frozen=True)
 class FluidLights:
-    """What lights a scene: a lamp, a sky and the floor, in amounts of light; directions (3,) are in camera axes."""
+    """The lights of a scene: a lamp, a sky and the floor, in linear light; directions (3,) are in camera axes."""
 
     lamp: np.ndarray  # direction to it, a unit vector
     up: np.ndarray  # direction
@@ -225,10 +225,10 @@ class FluidLights:
     horizon: np.ndarray
     floor: np.ndarray
     strength: float  # of the lamp
-    ambient: float  # strength of what comes from all sides
+    ambient: float  # strength of the ambient light
 
     def around(self, direction: np.ndarray) -> np.ndarray:
-        """Return what is seen in directions (..., 3): floor, horizon, sky, and the lamp as a large soft box."""
+        """Return the light from directions (..., 3): floor, horizon, sky, and the lamp as a large soft box."""
         rise = (direction @ self.up)[..., None]
         high = np.clip(rise, 0, 1) ** np.float32(0.6)
         low = _step(rise, -0.35, 0.02)
@@ -238,9 +238,9 @@ class FluidLights:
 
 
 def transmitted(appearance: Appearance, thickness: np.ndarray, length: float) -> np.ndarray:
-    """Return the share of light (..., 3) that is left behind a thickness (...), m, by the law of Beer and Lambert.
+    """Return the fraction of light (..., 3) transmitted by a thickness (...), m, by the law of Beer and Lambert.
 
-    The liquid takes what its optics say over the `length` of the scene, m: so a beaker and a reservoir look alike.
+    The optics give the absorption over the `length` of the scene, m, so that a beaker and a reservoir look alike.
     """
     optics = optics_of(appearance)
     loss = -np.log(np.clip(linear(appearance.color), 1e-3, 0.98))
@@ -257,16 +257,16 @@ def shaded(
     hollow: np.ndarray,
     lights: FluidLights,
 ) -> np.ndarray:
-    """Return the light (n, 3) that comes from n points of a surface.
+    """Return the light (n, 3) from n points of a surface.
 
-    The directions `normal`, outwards, and `towards` the eye are (n, 3), of length one; `through` is the share (n, 3) of
-    `transmitted`, `behind` the light (n, 3) from what lies behind, and `hollow` (n,) as of `liquid_surface.Surface`.
+    The unit vectors `normal`, outwards, and `towards` the eye are (n, 3); `through` is the result of `transmitted`, (n,
+    3), `behind` the light (n, 3) of the background, and `hollow` (n,) as in `liquid_surface.Surface`.
     """
     optics = optics_of(appearance)
     color = linear(appearance.color)
     facing = np.clip(np.einsum("ij,ij->i", normal, towards), 0, 1)[:, None]
     lit = normal @ lights.lamp
-    # Light that has been scattered inside wraps around the edges of its shadow.
+    # Light scattered inside softens the edges of its own shadow.
     wrap = np.float32(0.45 if optics.milk < 100 else 0.1)
     diffuse = lights.strength * np.clip((lit + wrap) / (1 + wrap), 0, 1)
     ambient = lights.ambient * (0.62 + 0.38 * (normal @ lights.up)) * (1 - 0.35 * np.clip(hollow, -1, 1))

@@ -12,7 +12,7 @@ HINT = "give a number, first, last, all, or A:B:S, from A up to but not B in ste
 
 
 def choose_frames(text: str, result: Result) -> list[int]:
-    """Return the positions in the result of the frames that a text selects, in order.
+    """Return the indices in the result of the frames selected by a text, in order.
 
     The text is N, "first", "last", "all" or "A:B:S"; a negative number counts from the end.
     """
@@ -29,15 +29,15 @@ def choose_frames(text: str, result: Result) -> list[int]:
     match = re.fullmatch(r"(-?\d+)?:(-?\d+)?(?::(-?\d+)?)?", word)
     start, end, step = (int(part) if part else None for part in match.groups()) if match else (0, 0, 0)
     if step == 0:
-        raise InputError(f'--frame "{text}" means no frame: {HINT}.')
+        raise InputError(f'--frame "{text}" selects no frame: {HINT}.')
     chosen = list(range(count))[start:end:step]
     if not chosen:
-        raise InputError(f"--frame {word} means no frame: {_holds(result)}.")
+        raise InputError(f"--frame {word} selects no frame: {_holds(result)}.")
     return chosen
 
 
 def evenly_spaced(ks: Sequence[int], count: int) -> list[int]:
-    """Return up to `count` of the frames, evenly spaced, the first and the last among them; of one, the last."""
+    """Return up to `count` of the frames, evenly spaced, with the first and the last; for a count of 1, the last."""
     if count == 1:
         return [ks[-1]]
     places = np.unique(np.linspace(0, len(ks) - 1, count).round().astype(int))

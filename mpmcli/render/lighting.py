@@ -1,8 +1,8 @@
-"""Lamps, and how each finish meets their light: the shader that colours every point of a surface.
+"""Lamps, and the shader that computes the colour of every point of a surface from its finish.
 
-The light is a formula of the direction (sky, ground, a lamp with a soft edge, a strip behind): it lights
-what is dull and is mirrored in what is glossy. What is clear shows the picture behind it, bent by its normals and
-dimmed by its thickness, after the law of Beer and Lambert, with Schlick's approximation of Fresnel's mirror.
+The light is a formula of the direction (sky, ground, a lamp with a soft edge, a strip behind); dull surfaces scatter
+it, and glossy ones mirror it. Clear bodies show the picture behind them, refracted by their normals and dimmed by their
+thickness, by the law of Beer and Lambert, with Schlick's approximation of Fresnel reflection.
 """
 
 import re
@@ -16,13 +16,13 @@ from mpmcli.render.render_scene import Appearance, RenderScene
 from mpmcli.render.settings import Theme, rgb
 from mpmcli.render.view import View
 
-CLEAR = ("water", "syrup", "translucent")  # finishes that show what is behind them
-# Names of what each vertex carries to the shader: lamp, sky, thickness; colour; roughness of the normal; normal.
+CLEAR = ("water", "syrup", "translucent")  # finishes that show the background
+# Names of the vertex attributes of the shader: lamp, sky, thickness; colour; roughness of the normal; normal.
 LIGHT, TINT, ROUGH, OUTWARDS = "lightMC", "tintMC", "roughMC", "outwardsMC"
 CARRIED = (LIGHT, TINT, ROUGH, OUTWARDS)
-# Handed from vertices to fragments, sampled at the centroid of the covered part of the pixel.
+# Passed from vertices to fragments, sampled at the centroid of the covered part of the pixel.
 VARYINGS = "centroid {0} vec4 carriedLight;\ncentroid {0} vec3 carriedTint, carriedRough, worldPoint, worldNormal;\n"
-BEHIND = "behindTexture"  # name of the picture behind clear things, and its depth from 0, near, to 1, far, as alpha
+BEHIND = "behindTexture"  # name of the picture behind clear bodies, with its depth from 0, near, to 1, far, as alpha
 
 
 def lights_of(scene: RenderScene, view: View, theme: Theme) -> dict[str, np.ndarray]:
@@ -50,7 +50,7 @@ def linear(color: str) -> np.ndarray:
 
 
 def vertex_code() -> tuple[str, str]:
-    """Return what the vertex shader declares and does to hand over what the vertices carry."""
+    """Return the declarations and the code of the vertex shader that pass on the vertex attributes."""
     declared = f"in vec4 {LIGHT};\n" + "".join(f"in vec3 {name};\n" for name in CARRIED[1:])
     done = f"carriedLight = {LIGHT}; carriedTint = {TINT}; carriedRough = {ROUGH};\n"
     return declared + VARYINGS.format("out"), done + f"worldPoint = vertexMC.xyz; worldNormal = {OUTWARDS};"
@@ -59,10 +59,10 @@ def vertex_code() -> tuple[str, str]:
 def fragment_code(
     scene: RenderScene, view: View, theme: Theme, appearance: Appearance, finer: int, *, by_field: bool, walled: bool
 ) -> tuple[str, str]:
-    """Return what the fragment shader declares and does for one material.
+    """Return the declarations and the code of the fragment shader for one material.
 
-    The window has `finer` pixels to one of the view, along each axis. Tints `by_field` mean something, so that light
-    must not change them much. What is `walled` leans on the walls of the domain that it lies at, and is flat there.
+    The window has `finer` pixels per pixel of the view, along each axis. Tints `by_field` represent values, so that
+    light must not change them much. A `walled` body is flat where it touches the walls of the domain.
     """
     extent = np.subtract(scene.upper, scene.lower)
     right, up, back = view.axes

@@ -1,4 +1,4 @@
-"""The surface of the liquids in a picture: where it is seen, how far away, which way it faces, and what is under it."""
+"""The surface of the liquids in a picture: coverage, depth, normals, and thickness of the liquid below it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -13,16 +13,16 @@ from mpmcli.render.render_scene import Appearance, RenderScene
 from mpmcli.render.view import View
 
 RADIUS = 0.9  # radius of the spheres of particles, in distances between particles: they overlap
-CORE = 0.5  # what is within this of a particle is liquid, however far it is from the next: a drop
-MIRRORED = 1.2  # particles within this of a wall are mirrored in it
+CORE = 0.5  # radius of a single drop, in distances between particles
+MIRRORED = 1.2  # particles closer to a wall than this are mirrored in it
 # Standard deviations, in distances between particles: of the smoothing of the depth, the outline, the thickness and
 # the normals.
 SMOOTHING, OUTLINE, SPREAD, SOFTNESS = 2.2, 1.1, 1.2, 0.4
-WIDEST = 60.0  # the widest that any of them may be, pixels
-# The largest sphere that is drawn as it is, pixels; larger ones, which are smoothed over as much, are drawn coarsely.
+WIDEST = 60.0  # largest value of any of them, pixels
+# The largest sphere drawn at full resolution, pixels; larger ones, which are smoothed as widely, are drawn coarsely.
 LARGEST = 24.0
 NOTHING = np.float32(1e9)  # depth, m, of a pixel that no liquid covers
-BLOCK = 24  # rows that are smoothed together: few enough to stay in the cache
+BLOCK = 24  # rows that are smoothed together, few enough to stay in the cache
 CUT = 2.0  # standard deviations at which a Gaussian is cut off
 MOST_TAPS = 16  # taps to one side of a pixel; a wider filter takes wider steps instead
 
@@ -40,18 +40,18 @@ class Liquid:
 
     @property
     def size(self) -> float:
-        """Pixels from one particle to the next, in the middle of them."""
+        """Distance between particles in pixels, in the middle of the liquid."""
         return self.distance * float(np.median(self.scale))
 
     @property
     def reach(self) -> float:
-        """Pixels around a particle in which it leaves a trace."""
+        """Pixels around a particle in which it changes the picture."""
         return min((RADIUS + 2) * self.distance * float(self.scale.max()) + 3, 2 * WIDEST)
 
 
 @dataclass(frozen=True)
 class Window:
-    """The part of the picture that the liquids are in; it may stand out over the edges of the picture."""
+    """The part of the picture with liquids; it may extend beyond the edges of the picture."""
 
     left: int
     top: int
@@ -65,13 +65,13 @@ class Window:
 
     @property
     def middles(self) -> tuple[np.ndarray, np.ndarray]:
-        """Middles of its pixels, from the left (1, columns) and from the top (rows, 1) of the picture."""
+        """Centres of its pixels, from the left (1, columns) and from the top (rows, 1) of the picture."""
         x = np.arange(self.left, self.left + self.columns) + 0.5
         y = np.arange(self.top, self.top + self.rows) + 0.5
         return x[None, :], y[:, None]
 
     def inner(self, size: tuple[int, int]) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
-        """Return where it lies in a picture of a size (width, height), and which part of it does."""
+        """Return its slices within a picture of a size (width, height), and the slices of the window itself."""
         low = max(self.top, 0), max(self.left, 0)
         high = min(self.top + self.rows, size[1]), min(self.left + self.columns, size[0])
         part = slice(low[0] - self.top, high[0] - self.top), slice(low[1] - self.left, high[1] - self.left)
@@ -80,18 +80,18 @@ class Window:
 
 @dataclass(frozen=True)
 class Surface:
-    """What is seen of the liquids in a window; directions are those of the camera: right, up, towards the viewer."""
+    """The visible surface of the liquids in a window; directions are in camera axes: right, up, towards the viewer."""
 
     window: Window
-    alpha: np.ndarray  # (h, w) share of each pixel that they cover
-    depth: np.ndarray  # (h, w) distance, m; it means something where `alpha` is above 0
-    owner: np.ndarray  # (h, w) which liquid it is
+    alpha: np.ndarray  # (h, w) fraction of each pixel that they cover
+    depth: np.ndarray  # (h, w) distance, m; valid where `alpha` is above 0
+    owner: np.ndarray  # (h, w) index of the liquid
     normal: np.ndarray  # (h, w, 3)
-    hollow: np.ndarray  # (h, w) from -1 of a ridge to 1 of a crease, about
+    hollow: np.ndarray  # (h, w) curvature, from about -1 at a ridge to 1 at a crease
 
 
 def window_of(liquids: Sequence[Liquid], view: View) -> Window | None:
-    """Return the box around what can be seen of the liquids; None when nothing can."""
+    """Return the box around the visible part of the liquids; None if none is visible."""
     if not liquids:
         return None
     margin = int(np.ceil(max(liquid.reach for liquid in liquids)))
@@ -106,7 +106,7 @@ def window_of(liquids: Sequence[Liquid], view: View) -> Window | None:
 
 
 def surface_of(liquids: Sequence[Liquid], window: Window, view: View, scene: RenderScene) -> Surface:
-    """Find the surface of the liquids, all of them as one body."""
+    """Return the surface of the liquids, which are treated as one body."""
     low, high = np.array(scene.lower), np.array(scene.upper)
     slack = [(liquid.position, 0.3 * liquid.distance) for liquid in liquids]
     inside = all(((x >= low - more) & (x <= high + more)).all() for x, more in slack)
@@ -120,7 +120,7 @@ def surface_of(liquids: Sequence[Liquid], window: Window, view: View, scene: Ren
         beyond = depth > exit_
         depth[beyond] = NOTHING
         core &= ~beyond
-        # The walls hold the liquid, whose spheres stand out of the domain there.
+        # The walls bound the liquid, whose spheres extend beyond the domain.
         at_wall = (blurred(((depth < entry) & (entry < NOTHING)).astype(np.float32), soft) > 0.5) & (depth < NOTHING)
     known = depth < NOTHING
     free = known & ~at_wall
@@ -146,7 +146,7 @@ def surface_of(liquids: Sequence[Liquid], window: Window, view: View, scene: Ren
     normal = normals(points, free)
     if at_wall.any():
         normal[at_wall] = facing[at_wall]
-    # Averaged over their surroundings, and continued a little over the edges.
+    # Averaged over the surroundings, and continued slightly beyond the edges.
     mean = np.stack([blurred(normal[..., k] * known, max(SOFTNESS * size, 0.5)) for k in range(3)], axis=-1)
     length = np.sqrt(np.einsum("ijk,ijk->ij", mean, mean))[..., None]
     normal = np.where(length > 1e-6, mean / np.maximum(length, 1e-6), normal)
@@ -154,9 +154,9 @@ def surface_of(liquids: Sequence[Liquid], window: Window, view: View, scene: Ren
 
 
 def layers_of(liquids: Sequence[Liquid], window: Window, wall: np.ndarray, samples: int) -> list[np.ndarray]:
-    """Return how thick each liquid is along each pixel of the window, (h, w), m, up to what is solid.
+    """Return the thickness of each liquid along the ray of each pixel of the window, (h, w), m, up to solid objects.
 
-    The `wall` is the distance of what is solid, m, in `samples` by `samples` points to each pixel of the picture.
+    The `wall` is the distance of solid objects, m, at `samples` by `samples` points per pixel of the picture.
     """
     rows, columns = wall.shape
     layers = []
@@ -174,7 +174,7 @@ def _moved(liquid: Liquid, window: Window) -> Liquid:
 
 
 def _nearest(liquids: Sequence[Liquid], window: Window) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the depth of the nearest sphere, m, which liquid it is of, and where the cores are."""
+    """Return the depth of the nearest sphere, m, the index of its liquid, and the pixels of the cores."""
     depth = np.full(window.shape, NOTHING, np.float32)
     owner = np.zeros(window.shape, np.int8)
     core = np.zeros(window.shape, bool)
@@ -190,7 +190,7 @@ def _nearest(liquids: Sequence[Liquid], window: Window) -> tuple[np.ndarray, np.
 
 
 def _spheres(pixels: np.ndarray, scale: np.ndarray, radius: float, shape: tuple[int, int]) -> np.ndarray:
-    """Return `sphere_depths`, worked out for squares of pixels where the spheres are large."""
+    """Return `sphere_depths`, computed for squares of pixels if the spheres are large."""
     side = int(np.ceil(radius * float(scale.max()) / LARGEST)) if len(scale) else 1
     if side <= 1:
         return sphere_depths(pixels, scale, radius, shape)
@@ -200,7 +200,7 @@ def _spheres(pixels: np.ndarray, scale: np.ndarray, radius: float, shape: tuple[
 
 
 def _mirrored(liquid: Liquid, view: View, scene: RenderScene) -> Liquid:
-    """Add the mirror images of the particles at the walls: the surface then meets a wall without a gap or a dent."""
+    """Add the mirror images of the particles at the walls, so that the surface meets a wall without a gap or a dent."""
     position, _ = with_images(liquid.position, MIRRORED * liquid.distance, scene.lower, scene.upper)
     pixels = view.pixels(position)
     front = pixels[:, 2] > max(view.near, liquid.distance)
@@ -209,9 +209,9 @@ def _mirrored(liquid: Liquid, view: View, scene: RenderScene) -> Liquid:
 
 
 def _passage(window: Window, view: View, scene: RenderScene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return where the rays of pixels enter the domain and where they leave it, m; `NOTHING` twice where they miss.
+    """Return the distances at which the rays of pixels enter and leave the domain, m; `NOTHING` twice if they miss it.
 
-    The last array (h, w, 3) holds the normals of the faces through which they enter, in camera axes.
+    The last array (h, w, 3) has the normals of the faces through which they enter, in camera axes.
     """
     start, direction = view.rays(*window.middles)
     ends = np.array([scene.lower, scene.upper])[:, None, None] - start
@@ -224,7 +224,7 @@ def _passage(window: Window, view: View, scene: RenderScene) -> tuple[np.ndarray
 
 
 def _hollow(normal: np.ndarray, covered: np.ndarray, size: float) -> np.ndarray:
-    """Return minus the divergence of the normals, times a few particles' size."""
+    """Return minus the divergence of the normals, times the size of a few particles."""
     spread = np.zeros(covered.shape, np.float32)
     spread[:, 1:-1] += 0.5 * (normal[:, 2:, 0] - normal[:, :-2, 0])
     spread[1:-1] -= 0.5 * (normal[2:, :, 1] - normal[:-2, :, 1])
@@ -233,15 +233,15 @@ def _hollow(normal: np.ndarray, covered: np.ndarray, size: float) -> np.ndarray:
 
 
 def sphere_depths(pixels: np.ndarray, scale: np.ndarray, radius: float, shape: tuple[int, int]) -> np.ndarray:
-    """Return the distance of the nearest sphere in every pixel, (h, w) float32, m; `NOTHING` where there is none.
+    """Return the distance of the nearest sphere in every pixel, (h, w) float32, m; `NOTHING` if there is none.
 
-    The centres (n, 3) are pixels from the left and from the top, and the distance, m; `scale` is the pixels to the
-    metre there. Each sphere is seen as from afar: a disc, whose depth is that of the half sphere.
+    The centres (n, 3) are pixels from the left and from the top, and the distance, m; `scale` is the pixels per metre
+    there. Each sphere is projected in parallel: a disc with the depth of the half sphere.
     """
     rows, columns = shape
     reach = radius * scale
     span = int(np.ceil(reach.max())) if len(reach) else 0
-    # A sphere whose middle is outside by its radius may reach out as far again.
+    # A sphere whose centre is outside by its radius may extend as far again.
     border = 2 * span + 1
     width = columns + 2 * border
     buffer = np.full((rows + 2 * border) * width, NOTHING, dtype=np.float32)
@@ -249,7 +249,7 @@ def sphere_depths(pixels: np.ndarray, scale: np.ndarray, radius: float, shape: t
     inside = (column >= -span) & (column < columns + span) & (row >= -span) & (row < rows + span)
     column, row, pixels, reach = column[inside], row[inside], pixels[inside], reach[inside]
     home = (row + border) * width + column + border
-    # A sphere smaller than a pixel still shows, in the pixel of its centre.
+    # A sphere smaller than a pixel is still drawn in the pixel of its centre.
     flat = (1.0 / np.maximum(reach, 0.75) ** 2).astype(np.float32)
     right, down = (pixels[:, 0] - column).astype(np.float32), (pixels[:, 1] - row).astype(np.float32)
     depth, radius = pixels[:, 2].astype(np.float32), np.float32(radius)
@@ -266,11 +266,11 @@ def sphere_depths(pixels: np.ndarray, scale: np.ndarray, radius: float, shape: t
 
 
 def smoothed(depth: np.ndarray, deviation: np.ndarray, radius: float) -> np.ndarray:
-    """Return a depth image (h, w), m, without the bumps of single particles, and with its edges where they were.
+    """Return a depth image (h, w), m, without the bumps of single particles and with unchanged edges.
 
-    The narrow-range filter, along the rows and the columns in turn: a Gaussian, of a deviation in pixels, in which a
-    neighbour counts as it is when its depth is within a range of the pixel's own, a range that grows with what it takes
-    in; as lying `radius` behind when it is farther back; and not at all, nor its mirror image, when it is in front.
+    The narrow-range filter is applied along the rows, then along the columns: a Gaussian, of a deviation in pixels. A
+    neighbour counts with its depth if that is within a range of the pixel's own, which grows with the depths included;
+    as lying `radius` behind if it is farther back; and not at all, nor its mirror image, if it is in front.
 
     Source: N. Truong and C. Yuksel, "A narrow-range filter for screen-space fluid rendering", Proc. ACM Comput.
     Graph. Interact. Tech. 1 (2018), 17, section 4.
@@ -290,7 +290,7 @@ def smoothed(depth: np.ndarray, deviation: np.ndarray, radius: float) -> np.ndar
 
 
 def _cleaned(depth: np.ndarray, radius: float) -> np.ndarray:
-    """Wipe out the streaks that rows and columns leave: a filter of five by five pixels, in both directions at once."""
+    """Remove the streaks of the one-dimensional filters by a filter of five by five pixels."""
     rows, columns = depth.shape
     padded = np.pad(depth, 2, constant_values=NOTHING)
     total, weight = np.zeros_like(depth), np.ones_like(depth)
@@ -303,7 +303,7 @@ def _cleaned(depth: np.ndarray, radius: float) -> np.ndarray:
 
 
 def _along_rows(depth: np.ndarray, decay: np.ndarray, radius: float, taps: int, step: int) -> np.ndarray:
-    """Filter along the rows, only where there is something."""
+    """Filter along the rows, only where there is liquid."""
     reach = taps * step
     result = depth.copy()
     padded = np.pad(depth, ((0, 0), (reach, reach)), constant_values=NOTHING)
@@ -349,26 +349,26 @@ def _narrow_range(part: np.ndarray, decay: np.ndarray, radius: np.float32, taps:
 
 
 def blurred(image: np.ndarray, deviation: float) -> np.ndarray:
-    """Return an image (h, w) under a Gaussian, pixels; its sum is kept but for what runs over the edges."""
+    """Return an image (h, w) blurred by a Gaussian, pixels; its sum is kept except for losses over the edges."""
     return gaussian_filter(image, deviation, mode="constant", truncate=3.0)
 
 
 def thickness(
     pixels: np.ndarray, volumes: np.ndarray, scale: np.ndarray, deviation: float, shape: tuple[int, int]
 ) -> np.ndarray:
-    """Return (h, w) float32, m: the volume of the particles in every pixel over the area that it sees of them.
+    """Return (h, w) float32, m: the volume of the particles in every pixel over the area of the pixel at their depth.
 
-    Times the area of a pixel, its sum over a picture in parallel projection is the volume of the particles. Each is
-    spread by a Gaussian of a deviation in pixels.
+    In parallel projection its sum over a picture, times the area of a pixel, is the volume of the particles. Each
+    particle is spread by a Gaussian of a deviation in pixels.
     """
     return blurred(deposited(pixels[:, :2] - 0.5, volumes * scale**2, shape).astype(np.float32), deviation)
 
 
 def normals(points: np.ndarray, covered: np.ndarray) -> np.ndarray:
-    """Return unit normals (h, w, 3) of a surface, towards the viewer, who looks along minus the third axis.
+    """Return unit normals (h, w, 3) of a surface, towards the viewer, who looks along the negative third axis.
 
-    In each direction the step to the neighbour is taken whose depth jumps less, so that edges stay sharp. Points
-    (h, w, 3) are in camera axes: to the right, up and towards the viewer, m; there is a surface where it is `covered`.
+    In each direction the difference to the neighbour with the smaller jump of depth is used, so that edges stay sharp.
+    Points (h, w, 3) are in camera axes: to the right, up and towards the viewer, m; `covered` marks the surface.
     """
     across, down = (_smaller_step(points, covered, axis) for axis in (1, 0))
     # Rows run downwards.
@@ -390,7 +390,7 @@ def _smaller_step(points: np.ndarray, covered: np.ndarray, axis: int) -> np.ndar
     steps = [np.pad(step, ends) for ends in (ahead, back)]
     sizes = [np.pad(size, ends[:2], constant_values=np.inf) for ends in (ahead, back)]
     smaller = np.where((sizes[0] < sizes[1])[..., None], *steps)
-    # Where neither is an edge their mean is one order more exact.
+    # If neither is an edge, their mean is one order more accurate.
     low, high = np.minimum(*sizes), np.maximum(*sizes)
     alike = np.isfinite(high) & (high <= 2 * low + np.float32(0.5) * pixel)
     return np.where(alike[..., None], np.float32(0.5) * (steps[0] + steps[1]), smaller)

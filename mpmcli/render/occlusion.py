@@ -1,7 +1,7 @@
-"""Occlusion: the fraction of the lamp's and of the sky's light that reaches a point past the particles.
+"""Occlusion: the fractions of the light of the lamp and of the sky that reach a point through the particles.
 
-Found on a coarse grid over the domain. VTK's SSAO and shadow maps were compared with it: their shadows are hard and
-fall from lines too, what is clear spoils or loses its picture, heaps of particles turn black, and they take longer.
+They are computed on a coarse grid over the domain. VTK's SSAO and shadow maps were compared: their shadows are hard and
+also fall from lines, clear bodies lose their picture, heaps of particles turn black, and they take longer.
 """
 
 import math
@@ -17,25 +17,25 @@ from mpmcli.render.render_scene import Finish, Group, RenderScene
 from mpmcli.render.settings import Theme, rgb
 from mpmcli.render.view import View
 
-# How much of the light that falls on it a finish holds back from what is below: 1 is a full shadow.
+# Fraction of the incident light that a finish blocks; 1 is a full shadow.
 OPACITY: dict[Finish, float] = {"water": 0.22, "syrup": 0.55, "translucent": 0.6}
-CELLS_LONG, CELLS = 88, 140_000  # cells along the longest side of the domain, and in all
-REACH = 0.7  # share of the height of the domain by which shadows may fall beside it
-DEPTH_OF_CELL = 1.1  # optical depth of a cell that is filled by what is wholly opaque
-STEEPEST = 3.5  # the farthest that light goes aside from layer to layer, cells
-# Directions of the sky's light: the cells by which it goes aside from layer to layer, and its share.
+CELLS_LONG, CELLS = 88, 140_000  # cells along the longest side of the domain, and largest total
+REACH = 0.7  # distance beyond the domain to which shadows may fall, as a fraction of its height
+DEPTH_OF_CELL = 1.1  # optical depth of a cell filled with opaque material
+STEEPEST = 3.5  # largest lateral shift of light from layer to layer, cells
+# Directions of the sky's light: lateral shift from layer to layer, cells, and weight.
 TURNS = 2 * math.pi * (np.arange(5) + 0.25) / 5
 SKY = [((0.0, 0.0), 0.2), *(((0.8 * math.cos(turn), 0.8 * math.sin(turn)), 0.16) for turn in TURNS)]
-# Share of the light of a cell that spreads to its neighbours from layer to layer: the lamp and the sky are no points.
+# Fraction of the light of a cell that spreads to its neighbours per layer, because lamp and sky are not points.
 LAMP_SPREAD, SKY_SPREAD = 0.35, 1.0
-LIFT = 1.4  # cells above a surface at which its light is looked up, so that it does not stand in its own shade
+LIFT = 1.4  # cells above a surface at which its light is evaluated, so that it does not shade itself
 FADE = 0.55  # distance from the domain over which the floor fades into the gradient, in longest sides of the domain
-STEP = 2  # pixels along each side of the blocks in which the floor is worked out
+STEP = 2  # pixels along each side of the blocks in which the floor is computed
 
 
 @dataclass(frozen=True)
 class Occlusion:
-    """Shares of light that arrive, on a grid (c, a, b): from the floor upwards, and along two level axes."""
+    """Fractions of light on a grid (c, a, b): from the floor upwards, and along two horizontal axes."""
 
     lamp: np.ndarray  # (c, a, b) float32 from 0 to 1, in the middle of the cells; `sky` alike
     sky: np.ndarray
@@ -46,12 +46,12 @@ class Occlusion:
     edge: float  # of a cell, m
 
     def at(self, points: np.ndarray, normals: np.ndarray) -> list[np.ndarray]:
-        """Return the shares (n,) of the lamp's and of the sky's light at points (n, 3) with normals (n, 3)."""
+        """Return the fractions (n,) of the lamp's and of the sky's light at points (n, 3) with normals (n, 3)."""
         cells = self._cells(points + (LIFT * self.edge) * normals)
         return [map_coordinates(share, cells, order=1, mode="nearest") for share in (self.lamp, self.sky)]
 
     def on_floor(self, points: np.ndarray) -> np.ndarray:
-        """Return the share of both at points (n, 3) on the floor; what lies beside the grid is in the light."""
+        """Return the fractions of both at points (n, 3) on the floor; points beyond the grid are fully lit."""
         return map_coordinates(self.floor, self._cells(points)[1:], order=1, mode="constant", cval=1.0)
 
     def _cells(self, points: np.ndarray) -> np.ndarray:
@@ -61,7 +61,7 @@ class Occlusion:
 def occlusion_by(
     scene: RenderScene, groups: Sequence[Group], lamp: np.ndarray, shades: Sequence[tuple[np.ndarray, np.ndarray]] = ()
 ) -> Occlusion:
-    """Return what groups, and opaque shades (places (n, 3), volumes (n,)), take of light.
+    """Return the occlusion by groups and by opaque shades (points (n, 3), volumes (n,)).
 
     The optical depth of each cell is that of the particles in it, by the law of Beer and Lambert; `lamp` is the
     direction (3,) towards the lamp, above the horizon.
@@ -88,7 +88,7 @@ def occlusion_by(
     rise, *aside = signs * lamp[axes]
     lamp_share, lamp_floor = _swept(depth, [(np.array(aside) / max(rise, 0.3), 1.0)], LAMP_SPREAD)
     sky_share, sky_floor = _swept(depth, SKY, SKY_SPREAD)
-    # Shadows fade out over the last cells, so that no edge shows.
+    # Shadows fade out over the last cells, so that no edge is visible.
     inwards = (np.clip(np.minimum(np.arange(n), np.arange(n)[::-1]) / 4.0, 0.0, 1.0) for n in shape[1:])
     floor = 1.0 - np.minimum.outer(*inwards) * (1.0 - 0.5 * (lamp_floor + sky_floor))
     return Occlusion(lamp_share, sky_share, floor.astype(np.float32), axes, signs, corner, edge)
@@ -97,12 +97,12 @@ def occlusion_by(
 def _swept(
     depth: np.ndarray, beams: Sequence[tuple[Sequence[float], float]], spread: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return what arrives in the cells (c, a, b) and on the floor (a, b), the sum over beams (slope (2,), weight)."""
+    """Return the light in the cells (c, a, b) and on the floor (a, b), summed over beams (slope (2,), weight)."""
     arrived, floor = np.zeros_like(depth), np.zeros_like(depth[0])
     taps = np.arange(-math.ceil(STEEPEST) - 1, math.ceil(STEEPEST) + 2)
     for slope, weight in beams:
         passed = np.exp(-depth * math.hypot(1.0, *slope))
-        # What is `slope` aside, linear between the cells, and then spread.
+        # The light from `slope` aside, linear between the cells, is then spread.
         hats = (np.maximum(1.0 - np.abs(taps - aside), 0.0) for aside in slope)
         kernels = [np.convolve(hat, (spread / 4, 1.0 - spread / 2, spread / 4), "same") for hat in hats]
         light = np.ones_like(floor)
@@ -116,7 +116,7 @@ def _swept(
 
 
 class Background:
-    """A gradient, brighter below than above, and a floor that is found once, with the shadows of every frame on it."""
+    """A gradient, brighter below than above, and a floor, computed once, with the shadows of each frame."""
 
     def __init__(self, scene: RenderScene, view: View, theme: Theme) -> None:
         width, height = view.size
@@ -130,7 +130,7 @@ class Background:
         starts, rays = view.rays(columns, rows)
         up = np.array(scene.up)
         level = min(up @ scene.lower, up @ scene.upper)
-        # Where lines of sight meet the floor, from above.
+        # Intersections of lines of sight with the floor, from above.
         with np.errstate(all="ignore"):
             fall = (rays * up).sum(axis=-1)
             length = (level - (starts * up).sum(axis=-1)) / fall
@@ -149,12 +149,12 @@ class Background:
         light = np.ones(self.coarse)
         if occlusion is not None:
             light[self.seen] = occlusion.on_floor(self.points)
-        # Shadows are taken in light as the eye counts it, and are never black.
+        # Shadows are applied in perceived brightness and are never black.
         image = self.rest + self.floor * self._finer(np.maximum(light, 0.0) ** 0.7 * 0.82 + 0.18)
         return (255.0 * np.clip(image, 0.0, 1.0) + 0.5).astype(np.uint8)
 
     def _finer(self, coarse: np.ndarray) -> np.ndarray:
-        """Interpolate values in the middles of blocks of pixels to all pixels, (h, w, 1)."""
+        """Interpolate values at the centres of blocks of pixels to all pixels, (h, w, 1)."""
         rows, columns = self.coarse
         image = Image.fromarray(coarse.astype(np.float32)).resize(
             (STEP * columns, STEP * rows), Image.Resampling.BILINEAR

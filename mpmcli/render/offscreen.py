@@ -31,7 +31,7 @@ class OffscreenRenderer:
         view.place(self.plotter)
 
     def add_box(self, scene: RenderScene, width: float = 1.5) -> None:
-        """Draw the edges of the domain, but for the three in front, which would cross all that is inside."""
+        """Draw the edges of the domain except the three in front, which would cross its contents."""
         import pyvista as pv
 
         corners, color = corners_of(scene), self._theme.wall
@@ -42,7 +42,7 @@ class OffscreenRenderer:
         self.plotter.add_mesh(box, color=color, line_width=width * self.samples, lighting=False, reset_camera=False)
 
     def add_dots(self, cloud: "pv.PolyData", *, lit: bool = True) -> "pv.Actor":
-        """Draw points as round dots, in the colours "rgb" of the cloud exactly where they are not lit."""
+        """Draw points as round dots, in the exact colours "rgb" of the cloud unless lit."""
         return self.plotter.add_points(
             cloud,
             scalars="rgb",
@@ -56,7 +56,7 @@ class OffscreenRenderer:
         )
 
     def add_light(self) -> None:
-        """Light the scene from over the left shoulder of the camera."""
+        """Add a light above and to the left of the camera."""
         import pyvista as pv
 
         light = pv.Light(light_type="camera light", intensity=1.0)
@@ -64,9 +64,9 @@ class OffscreenRenderer:
         self.plotter.add_light(light)
 
     def render(self) -> None:
-        """Render the window, for `picture` and `depth` to read."""
+        """Render the window for `picture` and `depth`."""
         if self.plotter.render_window.GetNeverRendered():
-            # The first picture of a window is drawn without what plotters set up when they are first shown.
+            # The first picture of a window lacks settings that plotters make when they are first shown.
             self.view.place(self.plotter)
             self.plotter.show(auto_close=False)
         self.view.place(self.plotter)
@@ -83,7 +83,7 @@ class OffscreenRenderer:
         return self._rows(array)
 
     def depth(self) -> np.ndarray:
-        """Return the distance of each sample from the camera, (h, w) float32, m; inf where nothing is drawn."""
+        """Return the distance of each sample from the camera, (h, w) float32, m; inf for the background."""
         array = vtkFloatArray()
         self.plotter.render_window.GetZbufferData(*self._corners, array)
         z = self._rows(array)[..., 0]

@@ -1,4 +1,4 @@
-"""Bodies in the plane: filled where particles cover it, with a soft light on their edges."""
+"""Draws bodies in 2D: areas covered by particles, with soft light on their edges."""
 
 import math
 
@@ -13,21 +13,22 @@ from mpmcli.render.render_scene import Appearance, Group, RenderScene, groups_of
 from mpmcli.render.settings import Theme, rgb
 from mpmcli.render.view import Slice, View
 
-SHARPNESS = 8  # steepness of the share of each of the bodies that meet in a pixel
-SOFT = 0.016  # depth, as a share of the height of the picture, to which light reaches into a body
-RIM = 1.5  # pixels of a dark rim, at a picture 720 pixels high
-DARKER = {"grains": 0.15, "crumbly": 0.20}  # by which share the rim is darker; the usual one is 0.28
+SHARPNESS = 8  # steepness of the shares of bodies that meet in a pixel
+SOFT = 0.016  # depth to which light reaches into a body, as a fraction of the height of the picture
+RIM = 1.5  # pixels of a dark rim, in a picture 720 pixels high
+DARKER = {"grains": 0.15, "crumbly": 0.20}  # fraction by which the rim is darker; 0.28 by default
 LAMP = (-0.5, 0.87)  # direction of the light in the picture, to the right and upwards
-# Radius of a grain of sand, in distances between particles, and by how much grains differ in brightness.
+# Radius of a grain of sand, in distances between particles, and variation of brightness of grains.
 GRAIN, VARIETY = 0.62, 0.17
-JITTER = 0.35  # by how much a grain is moved, in distances: heaps are no lattices
-# How rough the edge of crumbs is, as a share of the cover, and at which scale, in distances.
+JITTER = 0.35  # random displacement of a grain, in distances, because heaps are not lattices
+# Roughness of the edge of crumbs, as a fraction of the cover, and its scale, in distances.
 ROUGHNESS, CRUMB = 0.55, 0.75
 HOT, CRUST = np.float32([1.0, 0.62, 0.16]), np.float32([0.30, 0.05, 0.03])  # colours of lava, within and at its edge
 
 
-# How smooth bodies are shaded: shares of its colour that the edge has and of white added to it, how fast it goes over
-# into the inside, the share of its colour there, and shares of white added towards the light and of colour left away.
+# Shading of smooth bodies: fractions of body colour and of added white at the edge, steepness of the transition to the
+# interior, fraction of body colour there, and fractions of white added towards the light and of colour kept away from
+# it.
 LOOKS = {
     "water": (1.0, 0.42, 1.25, 0.93, 0.25, 1.0),
     "syrup": (1.06, 0.0, 1.0, (0.86, 0.72, 0.6), 0.30, 1.0),
@@ -80,7 +81,7 @@ class OutlinePainter:
         return (255.0 * picture + 0.5).astype(np.uint8)
 
     def _cover(self, group: Group, frame: Frame) -> np.ndarray:
-        """Return the share of each pixel's surroundings that a group covers, (h, w); its edge is where it is 1/2."""
+        """Return the fraction of each pixel's surroundings that a group covers, (h, w); it is 1/2 at the edge."""
         grid, step = self._coarse_grid(group)
         position = with_collider_images(group.position, group.distance, self.scene, frame)
         cover = cover_of(position, group.distance, self.scene.lower, self.scene.upper, grid)
@@ -100,23 +101,23 @@ class OutlinePainter:
         return spread(group.position, weights, CRUMB * group.distance, grid)
 
     def _colored(self, group: Group, cover: np.ndarray, frame: Frame) -> np.ndarray:
-        """Return the colours (h, w, 3) of a group, wherever it is."""
+        """Return the colours (h, w, 3) of a group, regardless of its cover."""
         body, lit = self._relief(cover)
         if self.colors is not None:
             color = self._by_field(group, frame)
         else:
             color = self._by_look(group, np.clip(2.0 * body - 1.0, 0.0, 1.0), lit)
         rim = np.clip(1.0 - self._inwards(cover, group.distance) / (RIM * self.view.size[1] / 720.0), 0.0, 1.0)
-        # Drops are all rim, and would be dark.
+        # Drops consist of rim alone and would be dark.
         rim *= np.clip(3.0 * body - 0.3, 0.0, 1.0)
         return color * (1.0 - DARKER.get(group.appearance.finish, 0.28) * rim)[..., None]
 
     def _by_look(self, group: Group, depth: np.ndarray, lit: np.ndarray) -> np.ndarray:
-        """Return the colours (h, w, 3) of the material of a group, by depth and light as `_relief` finds them."""
+        """Return the colours (h, w, 3) of the material of a group from depth and light, the results of `_relief`."""
         base = np.array(rgb(group.appearance.color), dtype=np.float32)
         ground = np.array(rgb(self.theme.ground), dtype=np.float32)
         if np.abs(base - ground).max() < 0.15:
-            # White on white: as much ink as makes it visible.
+            # White on white: add enough ink to make it visible.
             base = base + np.float32(0.25) * (np.array(rgb(group.appearance.ink), dtype=np.float32) - base)
         if group.appearance.finish == "grains":
             return self._grainy(group, base, depth, lit)
@@ -128,7 +129,7 @@ class OutlinePainter:
         return color
 
     def _inwards(self, cover: np.ndarray, distance: float) -> np.ndarray:
-        """Return how many pixels (h, w) lie between the edge and each pixel, near it, by the slope of the cover."""
+        """Return the distance in pixels (h, w) of each pixel from the edge, near it, from the slope of the cover."""
         steepest = self.grid.edge / (SPREAD * distance * math.sqrt(2.0 * math.pi))
         rise, slope = np.zeros_like(cover), np.zeros_like(cover)
         rise[1:-1] = 0.5 * (cover[2:] - cover[:-2])
@@ -136,11 +137,11 @@ class OutlinePainter:
         return (cover - 0.5) / np.maximum(np.sqrt(rise * rise + slope * slope), 0.12 * steepest)
 
     def _relief(self, cover: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the share of body far about each pixel, and how its edge faces the light, from -1 to 1."""
+        """Return the cover in a wide neighbourhood of each pixel, and how its edge faces the light, from -1 to 1."""
         step = max(int(self.view.size[1] / 240), 1)
         height, width = (size - size % step for size in cover.shape)
         mask = np.clip((cover - 0.5) * 3.0 + 0.5, 0.0, 1.0)
-        # Walls do not light what leans on them.
+        # Walls do not light bodies that touch them.
         mask = mask[:height, :width].reshape(height // step, step, width // step, step).mean(axis=(1, 3))
         body = soft(self._continued(mask, step), SOFT * self.view.size[1] / step)
         rise, slope = np.gradient(body)
@@ -149,7 +150,7 @@ class OutlinePainter:
         return _finer(body, step, cover.shape), _finer(np.clip(lit, -1.0, 1.0), step, cover.shape)
 
     def _continued(self, mask: np.ndarray, step: int) -> np.ndarray:
-        """Return a mask of coarse pixels whose values at the walls go on behind them."""
+        """Return a mask of coarse pixels, continued behind the walls."""
 
         def within(axis: int, size: int) -> np.ndarray:
             low = (self.scene.lower[axis] - self.grid.corner[axis]) / (self.grid.edge * step)
@@ -160,7 +161,7 @@ class OutlinePainter:
         return np.ascontiguousarray(mask[within(1, mask.shape[0])[:, None], within(0, mask.shape[1])])
 
     def _by_field(self, group: Group, frame: Frame) -> np.ndarray:
-        """Return colours (h, w, 3) by the mean of the values of the particles about each pixel."""
+        """Return colours (h, w, 3) from the mean value of the particles around each pixel."""
         values = np.asarray(self.colors.values(frame), dtype=np.float64)[group.rows]
         known = np.isfinite(values)
         deviation = SPREAD * group.distance
@@ -180,7 +181,7 @@ class OutlinePainter:
         best = np.zeros(self.grid.shape[0] * self.grid.shape[1], dtype=np.int64)
         moved = group.position + JITTER * group.distance * group.hashes[:, 1:]
         for rows, nodes, away in disk_nodes(moved, radius, self.grid):
-            # The nearest particle wins; of two as near, the later.
+            # The nearest particle is drawn; of two equally near, the later.
             key = ((1.0 - away / radius) * 4000).astype(np.int64) + 1
             np.maximum.at(best, nodes, (key << 32) + rows)
         near = (best >> 32).astype(np.float32) / 4000.0
@@ -208,7 +209,7 @@ def _shaded(appearance: Appearance, base: np.ndarray, depth: np.ndarray, lit: np
 
 
 def _within(places: np.ndarray, low: float, high: float, edge: float) -> np.ndarray:
-    """Return the share of pixels about `places` (n,), m, that lies from low to high."""
+    """Return the fraction of pixels at `places` (n,), m, between low and high."""
     return np.clip(np.minimum((places - low) / edge, (high - places) / edge) + 0.5, 0.0, 1.0).astype(np.float32)
 
 

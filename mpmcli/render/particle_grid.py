@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import convolve1d, gaussian_filter, map_coordinates
 
-STRAY = 4.0  # radii that a particle may lie outside of the domain and still be drawn
+STRAY = 4.0  # distance outside the domain up to which a particle is drawn, in radii
 SPREAD = 1.25  # standard deviation of the Gaussian of a particle's area, in distances between particles
-FINENESS = 3.0  # nodes of the grid to a distance, at least
+FINENESS = 3.0  # smallest number of grid nodes per distance between particles
 REACH = 3.2  # reach of the Gaussian, in standard deviations
 DISK = math.sqrt(1.0 / math.pi)  # radius of the disk that has the area of a particle, in distances
-# Cover of its own place, below which a particle stands alone and is drawn as a disk, and above which it is not.
+# Cover at its position, below which a particle is isolated and drawn as a disk, and above which it is not.
 ALONE, TOGETHER = 0.34, 0.42
 
 
@@ -34,17 +34,17 @@ def with_images(
 
 
 def drawable(position: np.ndarray, lower: Sequence[float], upper: Sequence[float], distance: float) -> np.ndarray:
-    """Return which of the particles (n, d) are numbers, and in the domain or close to it: (n,) bool."""
+    """Return which of the particles (n, d) are finite, and in the domain or close to it: (n,) bool."""
     d = position.shape[1]
     stray = 0.5 * STRAY * distance
-    # A comparison with a NaN is false, which is what is wanted.
+    # A comparison with a NaN is false, as intended.
     return ((position >= np.array(lower[:d]) - stray) & (position <= np.array(upper[:d]) + stray)).all(axis=1)
 
 
 def deposited(place: np.ndarray, amounts: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
     """Return the sum (rows, columns) of the amounts (n,) of particles, each shared by area among four nodes.
 
-    Places (n, 2) are columns and rows from the first node, in cells; what falls outside is dropped.
+    Places (n, 2) are columns and rows from the first node, in cells; amounts outside are dropped.
     """
     base = np.floor(place).astype(np.int64)
     part = place - base
@@ -58,14 +58,14 @@ def deposited(place: np.ndarray, amounts: np.ndarray, shape: tuple[int, int]) ->
 
 
 def sampled(image: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:
-    """Return values between the pixels of an image (r, c, k), linear in between; the outermost go on outside."""
+    """Return values between the pixels of an image (r, c, k) by linear interpolation, constant beyond its edges."""
     place = np.stack([row, column]) - 0.5
     channels = (map_coordinates(image[..., k], place, order=1, mode="nearest") for k in range(image.shape[2]))
     return np.stack(list(channels), axis=-1)
 
 
 def blurred_along(values: np.ndarray, axis: int) -> np.ndarray:
-    """Return values blurred along an axis with weights 1/4, 1/2, 1/4; what would leave at an end is kept there."""
+    """Return values blurred along an axis with weights 1/4, 1/2, 1/4; the ends keep the part that would leave."""
     return convolve1d(values, (0.25, 0.5, 0.25), axis)
 
 
@@ -81,10 +81,10 @@ class Grid:
 def cover_of(
     position: np.ndarray, distance: float, lower: Sequence[float], upper: Sequence[float], grid: Grid
 ) -> np.ndarray:
-    """Return the share (rows, columns) of each node's surroundings that particles (n, 2) cover.
+    """Return the fraction (rows, columns) of each node's surroundings that particles (n, 2) cover.
 
-    It is 1 within a body, 1/2 on its straight edge, and does not fade at the walls of the domain, which are mirrors.
-    A particle that stands alone is a disk of its own area, 1/2 on its rim.
+    It is 1 within a body, 1/2 on its straight edge, and does not fade at the walls of the domain, which are mirrors. An
+    isolated particle is a disk of its own area, with 1/2 on its rim.
     """
     images = with_images(position, REACH * SPREAD * distance, lower, upper)[0]
     deviation = SPREAD * distance
@@ -96,7 +96,7 @@ def cover_of(
     if loose.any():
         alone = np.clip((TOGETHER - share[loose]) / (TOGETHER - ALONE), 0.0, 1.0)
         radii = DISK * distance * np.sqrt(alone)
-        # As steep on the rim of a disk as on an edge.
+        # The slope on the rim of a disk equals that on an edge.
         slope = 1.0 / (deviation * math.sqrt(2.0 * math.pi))
         flat = cover.reshape(-1)
         for rows, nodes, away in disk_nodes(position[loose], float(radii.max()) + grid.edge, grid):
@@ -110,7 +110,7 @@ def spread(position: np.ndarray, weights: np.ndarray, deviation: float, grid: Gr
     shape = (grid.shape[0] + 2 * margin, grid.shape[1] + 2 * margin)
     place = (position - np.array(grid.corner)) / grid.edge + margin
     total = deposited(place, weights, shape)
-    # Sharing out between two nodes has blurred already, by a sixth of a cell squared on average.
+    # The distribution between two nodes has already blurred, with a mean variance of a sixth of a cell squared.
     width = math.sqrt(max((deviation / grid.edge) ** 2 - 1.0 / 6.0, 0.0))
     return soft(total.astype(np.float32), width)[margin:-margin, margin:-margin] / np.float32(grid.edge**2)
 
@@ -121,7 +121,7 @@ def soft(values: np.ndarray, deviation: float) -> np.ndarray:
 
 
 def disk_nodes(position: np.ndarray, reach: float, grid: Grid) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Yield the nodes about particles (n, 2), in turn: rows, nodes and distances, m, (k,)."""
+    """Yield the nodes around particles (n, 2), in batches: rows, nodes and distances, m, (k,)."""
     place = (position - np.array(grid.corner)) / grid.edge
     base = np.rint(place).astype(np.int64)
     count = math.ceil(reach / grid.edge)

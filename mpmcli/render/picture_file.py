@@ -34,7 +34,7 @@ FEW = 12  # number of pictures from which the palette of a gif is computed
 SKIPPED = b"free"  # type of the box that players of .mp4 skip
 DIGEST_MAX = 64
 GIF_FPS_MAX = 50  # browsers slow down faster films
-COLOURS = 255  # of the palette, beside the one that marks pixels unchanged since the previous picture
+COLOURS = 255  # of the palette, besides the one that marks pixels unchanged since the previous picture
 QUALITY = 18  # constant rate factor of H.264: 18 is visually near-lossless, 23 is ffmpeg's default
 PRESET = "veryfast"  # three times as fast as "medium", for visually equal films of the same size
 THREADS = 2  # fixed, since the bytes of a film depend on the number of threads
@@ -53,7 +53,8 @@ BT709 = (
 def settings_digest(settings: dict[str, Any]) -> str:
     """Return a digest of the settings of a picture and of the version of mpmcli, 32 hexadecimal digits.
 
-    They hold what JSON can, and numpy's numbers and arrays, which count to their last digit; keys may have any order.
+    They contain JSON values and numpy numbers and arrays, which count to the last digit; the order of keys is
+    irrelevant.
     """
 
     def plain(value: Any) -> Any:
@@ -85,7 +86,7 @@ def write_picture(path: Path, image: np.ndarray, digest: str) -> None:
 
 
 def digest_of(path: Path) -> str | None:
-    """Return the digest in a picture; "" where mpmcli did not make the file or it is not whole, None where none is."""
+    """Return the digest in a picture; "" if the file is incomplete or not of mpmcli, None if there is no file."""
     from PIL import Image
 
     try:
@@ -94,7 +95,7 @@ def digest_of(path: Path) -> str | None:
             return image.info.get(KEYWORD, "")
     except (FileNotFoundError, NotADirectoryError):
         return None
-    # Of a damaged or a huge file Pillow raises almost anything.
+    # Pillow raises almost any exception at a damaged or huge file.
     except Exception:
         return ""
 
@@ -112,7 +113,7 @@ def require_writable(path: Path) -> None:
 
 
 def write_fault(path: Path, error: OSError) -> MpmcliError:
-    """Return the exception for a file that could not be written: RunError for a fault of the disk, else InputError."""
+    """Return the exception for a failed write: RunError for a fault of the disk, else InputError."""
     reason = error.strerror or str(error)
     if isinstance(error, FileExistsError | NotADirectoryError):
         reason = f"{path.parent} is no directory"
@@ -124,7 +125,7 @@ def write_fault(path: Path, error: OSError) -> MpmcliError:
 def check_film(path: Path, fps: float) -> None:
     """Raise InputError for a file that is neither .mp4 nor .gif, or for a rate out of range."""
     if path.suffix.lower() not in (".mp4", ".gif"):
-        raise InputError(f"{path} would be no film: give a name that ends in .mp4 or .gif.")
+        raise InputError(f"{path} cannot be a film: give a name that ends in .mp4 or .gif.")
     if not (math.isfinite(fps) and FPS_MIN <= fps <= FPS_MAX):
         raise InputError(f"{fps:g} frames per second are not possible: give {FPS_MIN:g} to {FPS_MAX:g}.")
     if path.suffix.lower() == ".gif" and fps > GIF_FPS_MAX:
@@ -141,11 +142,11 @@ def write_film(
     digest: str = "",
     watch: Callable[[int], None] = lambda done: None,
 ) -> None:
-    """Write a film of PNG files, whole or not at all, in place of what is there; the same files give the same bytes.
+    """Write a film of PNG files atomically, replacing an existing file; the same files give the same bytes.
 
-    An .mp4 is H.264 in yuv420p, the colours of BT.709, which every player shows; a picture of odd width or height
-    gets one more column or row like its last. A .gif repeats for ever and has 255 colours, chosen for the whole film;
-    its frames last whole hundredths of a second, such that each begins within half of one of its time.
+    An .mp4 is H.264 in yuv420p, the colours of BT.709, which every player shows; a picture of odd width or height gets
+    one more column or row like its last. A .gif repeats for ever and has 255 colours, chosen for the whole film; its
+    frames last whole hundredths of a second, and each begins within half a hundredth of its time.
 
     The `digest` is one of `settings_digest`; `watch` is called after each picture with the number of pictures read.
     """
@@ -173,7 +174,7 @@ def write_film(
 
 
 def film_digest(path: Path) -> str | None:
-    """Return the digest in a film; "" where mpmcli did not make the file, None where none is."""
+    """Return the digest in a film; "" if the file is not of mpmcli, None if there is no file."""
     try:
         with path.open("rb") as file:
             file.seek(0, os.SEEK_END)
@@ -187,7 +188,7 @@ def film_digest(path: Path) -> str | None:
 
 
 def _end(digest: str) -> bytes:
-    """Return what follows the film: a box that players of .mp4 skip; those of gif do not read beyond its end."""
+    """Return the trailer of a film: a box that .mp4 players skip; .gif players do not read beyond the end."""
     content = KEYWORD.encode() + digest.encode("ascii")
     return struct.pack(">I", 8 + len(content)) + SKIPPED + content
 
@@ -201,13 +202,13 @@ def _contents(pictures: Sequence[Path], size: tuple[int, int], watch: Callable[[
 
 
 def _checked(picture: Path, size: tuple[int, int] | None) -> tuple[int, int]:
-    """Return width and height of a picture; raise InputError where they are not `size`, or the file is damaged."""
+    """Return width and height of a picture; InputError: they are not `size`, or the file is damaged."""
     from PIL import Image
 
     try:
         with Image.open(picture, formats=["PNG"]) as image:
             image.verify()
-    # A damaged file makes Pillow raise a SyntaxError too.
+    # Pillow may also raise a SyntaxError at a damaged file.
     except (OSError, ValueError, SyntaxError) as error:
         raise InputError(f"{picture} cannot be read as a picture: make it anew with --overwrite.") from error
     if size not in (None, image.size):
@@ -219,7 +220,7 @@ def _checked(picture: Path, size: tuple[int, int] | None) -> tuple[int, int]:
 
 
 def _write_palette(few: Sequence[Path], path: Path) -> None:
-    """Write the colours of a few pictures as a picture, chosen by the root of their frequency: no ground dominates."""
+    """Write a palette of a few pictures as a picture; colours are weighted by the square root of their frequency."""
     from PIL import Image
 
     for picture in few:
@@ -228,14 +229,14 @@ def _write_palette(few: Sequence[Path], path: Path) -> None:
     colors, counts = np.unique(np.concatenate(pixels), return_counts=True)
     chosen = np.repeat(colors, np.ceil(np.sqrt(counts)).astype(int)).view(np.uint8).reshape(1, -1, 4)
     image = Image.fromarray(chosen).convert("RGB").quantize(COLOURS, method=Image.Quantize.MEDIANCUT)
-    # The last of the 256 that ffmpeg asks for is clear.
+    # The last of the 256 colours for ffmpeg is transparent.
     table = np.resize(np.array(image.getpalette(), np.uint8).reshape(-1, 3), (256, 3))
     opaque = np.where(np.arange(256) < COLOURS, np.uint8(255), np.uint8(0))
     Image.fromarray(np.column_stack([table, opaque]).reshape(16, 16, 4)).save(path)
 
 
 def _encode(contents: Iterator[bytes], form: Sequence[str], place: Path, name: Path, fps: float) -> None:
-    """Let ffmpeg write the contents of PNG files, one at a time, to a place; errors call it by its name."""
+    """Write the contents of PNG files with ffmpeg, one at a time, to `place`; errors call it `name`."""
     import imageio_ffmpeg
 
     try:
@@ -245,7 +246,7 @@ def _encode(contents: Iterator[bytes], form: Sequence[str], place: Path, name: P
             "There is no ffmpeg for films: install imageio-ffmpeg or ffmpeg, or name its program in IMAGEIO_FFMPEG_EXE."
         ) from error
     given = ["-f", "image2pipe", "-c:v", "png", "-r", str(Fraction(fps).limit_denominator(100_000)), "-i", "pipe:0"]
-    # No time, no version: the same pictures are the same bytes.
+    # No time and no version, so that the same pictures give the same bytes.
     exact = ["-threads", str(THREADS), "-map_metadata", "-1", "-fflags", "+bitexact", "-flags:v", "+bitexact"]
     with TemporaryFile() as messages:
         try:
@@ -260,7 +261,7 @@ def _encode(contents: Iterator[bytes], form: Sequence[str], place: Path, name: P
         except OSError as error:
             raise RunError(f"ffmpeg could not be started ({error.strerror}): is {program} the program?") from error
         try:
-            # Where ffmpeg has ended its stderr gives the reason.
+            # If ffmpeg has ended, its stderr has the reason.
             with suppress(BrokenPipeError):
                 for content in contents:
                     process.stdin.write(content)
@@ -278,5 +279,5 @@ def _encode(contents: Iterator[bytes], form: Sequence[str], place: Path, name: P
     if status != 0:
         how = f"it was ended by signal {-status}" if status < 0 else f"its status is {status}"
         raise RunError(
-            f"ffmpeg failed to write {name}, {how}: {words.rstrip('.') or 'it said nothing'}; mpmcli doctor tries it."
+            f"ffmpeg failed to write {name}, {how}: {words.rstrip('.') or 'it gave no reason'}; mpmcli doctor tests it."
         )

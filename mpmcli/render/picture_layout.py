@@ -1,4 +1,4 @@
-"""The layout of a picture: title, time, colour bar or legend, scale bar, the walls of a flat domain."""
+"""The layout of a picture: title, time, colour bar or legend, scale bar, and the walls of a 2D domain."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -27,11 +27,11 @@ SMALLEST = 0.55
 TEXT, SMALL = 17, 14
 PAD = 16
 TOP, BOTTOM, LABEL, GAP = 44, 44, 26, 8
-LEAST = 16  # least pixels along each side of the viewport
+LEAST = 16  # smallest number of pixels along each side of the viewport
 BAR_WIDTH, TICK = 18, 6
 SWATCH = 16
 LEGEND_SHARE = 0.3  # largest fraction of the width for legends; longer names are shortened
-ARROW = 0.15  # length of the largest velocity, as a part of the domain
+ARROW = 0.15  # length of the largest velocity arrow, as a fraction of the domain
 SCALE_SHARE = 0.18  # largest length of a scale bar, as a fraction of the width
 TICKS = 6
 NO_NUMBER = "no number"
@@ -44,7 +44,7 @@ SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 @dataclass(frozen=True)
 class PictureLayout:
-    """The frame of all pictures of one film, or of the pictures of a montage."""
+    """The layout shared by all pictures of one film, or by the pictures of a montage."""
 
     size: tuple[int, int]  # of the whole picture, pixels, (width, height)
     scene: RenderScene
@@ -76,8 +76,8 @@ class PictureLayout:
     ) -> np.ndarray:
         """Return the whole picture (height, width, 3) uint8 from pictures of the scene, row by row, and their times, s.
 
-        It tells whether particles are `missing`, whose value is not a number. The captions, or else the times, stand
-        above each picture of a montage, cut where they are too long.
+        With `missing` particles, whose value is not a number, the colour bar has an entry for them. The captions, or
+        else the times, are above each picture of a montage, shortened if too long.
         """
         from PIL import Image, ImageDraw
 
@@ -87,7 +87,7 @@ class PictureLayout:
             x, y = self._place(k)
             whole.paste(Image.fromarray(picture), (x, y))
             if self._label:
-                # What fits of a caption, or a time if all of it fits.
+                # The part of a caption that fits, or a time if it fits completely.
                 room = self.viewport_size[0]
                 text = self._cut(captions[k], room) if captions else time_text(time, self.times)
                 free = room - self._small.getlength(text)
@@ -111,7 +111,7 @@ class PictureLayout:
         return np.asarray(whole)
 
     def height_for(self, aspect: float) -> int:
-        """Return the height of the whole picture at which those of the scene have this ratio of height to width."""
+        """Return the height of the whole picture that gives those of the scene this ratio of height to width."""
         rows = self.grid[1]
         viewport = round(self.viewport_size[0] * aspect) + self._label
         return self._px(TOP) + self._bottom + rows * viewport + (rows - 1) * self._px(GAP)
@@ -149,7 +149,7 @@ class PictureLayout:
         return cut(text, lambda text: self._small.getlength(text) <= room)
 
     def _write(self, draw: "ImageDraw", x: float, y: float, text: str, color: str = "", anchor: str = "lm") -> None:
-        """Draw a small text in a colour, by default that of texts."""
+        """Draw a small text in a colour, by default the text colour."""
         draw.text((x, y), text, color or self.theme.text, self._small, anchor=anchor)
 
     @property
@@ -179,7 +179,7 @@ class PictureLayout:
         draw.text((pad, middle), title, self.theme.text, bold, anchor="lm")
 
     def _walls(self, draw: "ImageDraw", view: View, place: tuple[int, int]) -> None:
-        """Draw the walls just outside of the domain, so that nothing inside is hidden.
+        """Draw the walls just outside the domain, so that they hide nothing inside.
 
         Open faces of a 2D domain are left out, and periodic ones are dashed.
         """
@@ -258,11 +258,11 @@ class PictureLayout:
         self._write(draw, pad + pixels + self._px(8), y, length_text(length))
 
     def _draw_lengths(self, draw: "ImageDraw", view: View) -> None:
-        """Write the length of the domain along each axis beside its lowest edge in the picture, or its leftmost one."""
+        """Write the length of the domain along each axis next to its lowest or leftmost edge in the picture."""
         corners = corners_of(self.scene)
         places = view.pixels(corners) + np.array([*self._place(0), 0])
         if (places[:, 2] < view.near).any():
-            # The camera is inside of the domain.
+            # The camera is inside the domain.
             return
         middle = places[:, :2].mean(axis=0)
         for axis in range(3):
@@ -352,7 +352,7 @@ def time_text(time: float, times: Sequence[float]) -> str:
     ordered = np.unique(np.asarray(times, dtype=np.float64)) / factor
     step = float(np.median(np.diff(ordered))) if len(ordered) > 1 else 0.1
     if not 0.0 < step < math.inf:
-        # Of times in a damaged file, whose differences may be too large or too small for numbers.
+        # Times in a damaged file may have differences that overflow or underflow.
         step = 0.1
     least = min(max(0, math.ceil(-math.log10(step) - 1e-9)), DIGITS_MAX)
     # The digits of an exact step such as 0.25; one more than necessary for others such as 1/3.

@@ -1,4 +1,4 @@
-"""Pictures of frames: their painters, which files are missing or outdated, and drawing these in several processes."""
+"""Pictures of frames: selects painters, finds missing or outdated files, and draws them in several processes."""
 
 import re
 from collections.abc import Callable, Sequence
@@ -24,17 +24,17 @@ from mpmcli.render.view import View, aspect_of, slice_of, view_of
 from mpmcli.render.window import choose_window
 from mpmcli.scene.colliders import Plane
 
-# Least ratio of height to width, and inverse of the largest, of pictures whose height follows from the scene.
+# Smallest ratio of height to width, and inverse of the largest, of pictures whose height follows from the scene.
 FLATTEST = 0.2
 LARGEST, NARROWEST = (1280, 720), 640  # pixels of pictures whose size follows from the scene
-LEVEL = 1e-6  # length of a direction along the ground, of which less is none
-HIDDEN = 0.05  # share of the particles within the box of a collider, from which on it is cut open
-FITTING_ROUNDS = 4  # iterations in which the sizes of the texts and of the picture settle
+LEVEL = 1e-6  # smallest horizontal length of a direction that is not vertical
+HIDDEN = 0.05  # fraction of the particles within the box of a collider from which on it is cut open
+FITTING_ROUNDS = 4  # iterations until the sizes of texts and picture are consistent
 FOREIGN = "{path} is there already, and mpmcli render did not make it: give another place with -o, or --overwrite."
 
 
 class Painter(Protocol):
-    """Draws the scene of a frame; `fields` are read of each frame. It is made once in each process."""
+    """Draws the scene of a frame; `fields` are read from each frame. Each process creates one painter."""
 
     fields: tuple[str, ...]
 
@@ -45,7 +45,7 @@ class Painter(Protocol):
 
 @dataclass(frozen=True)
 class RenderSetup:
-    """Everything that the pictures of one result with one setting share, except the painter and its window."""
+    """The data shared by the pictures of one result and one setting, except the painter and its window."""
 
     result: Result
     settings: Settings  # with the limits of the colours filled in
@@ -86,7 +86,7 @@ def surface_painter(scene: RenderScene, view: View, theme: Theme, colors: Colori
 
 
 def set_up(result: Result, settings: Settings) -> RenderSetup:
-    """Return what the pictures of a result share, and fill in what the settings leave open."""
+    """Return the shared data of the pictures of a result, with default settings filled in."""
     scene, theme = render_scene_of(result), THEMES[settings.theme]
     colliders = () if settings.colliders == "none" else scene.colliders
     held = () if settings.colliders == "none" or settings.arrows is None else scene.held
@@ -124,7 +124,7 @@ def set_up(result: Result, settings: Settings) -> RenderSetup:
         settings = replace(settings, size=layout.size)
         require_possible(*layout.size, f"{width}xauto")
     view = view_of(scene, camera, layout.viewport_size)
-    # Half of them is left out, in front of a plane along the upward axis; seen from above they are open anyway.
+    # The half in front of a plane along the upward axis is left out; seen from above they are open anyway.
     towards = view.axes[2] * (np.array(scene.up) == 0.0)
     if hollow and np.linalg.norm(towards) > LEVEL:
         scene = replace(scene, hollow=hollow, towards=tuple(towards.tolist()))
@@ -132,7 +132,7 @@ def set_up(result: Result, settings: Settings) -> RenderSetup:
 
 
 def _within(layout: PictureLayout, aspect: float) -> tuple[int, int]:
-    """Return the largest size within `LARGEST` without empty space, even as films need it, `NARROWEST` at least."""
+    """Return the largest size within `LARGEST` without empty space, even as films require, at least `NARROWEST`."""
     (width, height), highest = layout.size, LARGEST[1]
     while height > highest and width > NARROWEST:
         width -= 16
@@ -141,7 +141,7 @@ def _within(layout: PictureLayout, aspect: float) -> tuple[int, int]:
 
 
 def _hollow(scene: RenderScene, result: Result) -> tuple[int, ...]:
-    """Return the colliders of a 3D scene that would hide what is inside: much starts within the box of each."""
+    """Return the colliders of a 3D scene that would hide their contents: many particles start within their boxes."""
     found = []
     for number, collider in enumerate(scene.colliders if scene.dimension == 3 else ()):
         if collider.side == "outside" and not collider.free and not isinstance(collider.form, Plane):
@@ -153,7 +153,7 @@ def _hollow(scene: RenderScene, result: Result) -> tuple[int, ...]:
 
 
 def expected_times(result: Result) -> tuple[float, ...]:
-    """Return the times, s, of the whole run, also while it goes on: labels have their digits and unit from them."""
+    """Return the times, s, of the whole run, also during it; they determine the digits and unit of labels."""
     header = result.header
     if header.end is not None and header.frames is not None and header.frames > 1:
         step = header.end / (header.frames - 1)
@@ -166,19 +166,19 @@ def expected_times(result: Result) -> tuple[float, ...]:
 class PlannedPicture:
     """The picture file of one frame, or of a montage."""
 
-    k: int  # position of the frame in the result
+    k: int  # index of the frame in the result
     path: Path
-    digest: str  # of everything that it depends on
+    digest: str  # digest of everything that it depends on
     made: bool  # whether the file exists with this digest
 
 
-# Numbers of particles of a frame whose value is not a number, and of those without a place.
+# Numbers of particles of a frame with a missing value, and without a position.
 Outcome = tuple[int, int]
 
 
 @dataclass(frozen=True)
 class PictureJob:
-    """Pictures of some frames of a result at a path, as a worker process makes them; the plan is by frame."""
+    """Draws pictures of some frames of a result at a path, in a worker process; the plan is by frame."""
 
     source: Path
     settings: Settings  # as `set_up` has filled them in
@@ -212,7 +212,7 @@ class PictureRenderer:
         captions = [setup.captions[k] for k in ks] if setup.captions else None
         for k in ks:
             if setup.settings.mode == "density":
-                # Which needs to know how many particles share the mass of a body.
+                # It needs the number of particles that share the mass of a body.
                 frame = setup.result.frame(k, (*self._painter.fields, *({STATUS} & set(setup.result.field_names))))
             else:
                 frame = setup.result.present_frame(k, self._painter.fields)
@@ -227,9 +227,9 @@ class PictureRenderer:
 
 
 def picture_digest(result: Result, settings: Settings, ks: Sequence[int]) -> str:
-    """Return a digest of what a picture of some frames depends on.
+    """Return a digest of the inputs of a picture of some frames.
 
-    The ledger's row represents the particles, since it holds their energies and momenta to the last bit. The text of a
+    The ledger's row represents the particles, because it has their energies and momenta to the last bit. The text of a
     time depends on other frames.
     """
     times = expected_times(result)
@@ -247,10 +247,10 @@ def plan_picture(
 ) -> PlannedPicture:
     """Return the picture of a frame, or a montage of several, and whether its file exists and is up to date.
 
-    InputError is raised where the file exists and mpmcli did not make it; `overwrite` replaces it, and draws it again.
+    InputError: the file exists and is not of mpmcli; `overwrite` replaces it and draws it again.
     """
     digest, present = picture_digest(result, settings, ks), digest_of(path)
-    # A digest of another form is of a file that is no picture of frames, such as a ledger's.
+    # A digest of another form belongs to another kind of picture, such as that of a ledger.
     if present is not None and not re.fullmatch("[0-9a-f]{32}", present) and not overwrite:
         raise InputError(FOREIGN.format(path=path))
     return PlannedPicture(ks[0], path, digest, present == digest and not overwrite)

@@ -1,4 +1,4 @@
-"""Surfaces of particles: closed meshes of triangles in 3D, flat polygons in 2D, and both as files for other tools."""
+"""Surfaces of particles: closed triangle meshes in 3D, flat polygons in 2D, and files of both for other tools."""
 
 import json
 import re
@@ -18,17 +18,17 @@ from mpmcli.processes.pool import render_frames
 from mpmcli.render.particle_grid import FINENESS, Grid, blurred_along, cover_of, drawable, with_images
 from mpmcli.render.render_scene import RenderScene, groups_of, render_scene_of
 
-# Smoothing length of the kernel of splashsurf, in particle radii, share of the full density at which the surface lies,
-# and rounds of Laplacian smoothing, weighted so that thin sheets keep their volume.
+# Smoothing length of the kernel of splashsurf, in particle radii, fraction of the full density at the surface, and
+# rounds of Laplacian smoothing, weighted so that thin sheets keep their volume.
 USUAL, CLOSE = (2.5, 0.5, 20), (1.8, 0.55, 2)
 CUBE = 1.1  # edge of a marching cube, in particle radii
 IMAGE_REACH = 5.0  # radii from a wall within which particles have images behind it: the support of the usual kernel
-# Edge of the cells in which particles are counted, in radii, and how many cells there may be.
+# Edge of the cells in which particles are counted, in radii, and largest number of cells.
 FULLNESS_CELL, FULLNESS_CELLS = 4.0, 4e6
-# Shares of room filled, below which a vertex is not smoothed and above which it is smoothed in full.
+# Filled fractions of space below which a vertex is not smoothed and above which it is fully smoothed.
 ALONE, HALF = 0.03, 0.22
-CONTACT = 3.0  # radii from a wall within which a particle touches it, and aside from its middle what is near it
-NODES = 3e7  # most nodes of the grid on which a flat surface is found
+CONTACT = 3.0  # radii from a wall within which a particle touches it; lateral radii of its surroundings
+NODES = 3e7  # largest number of nodes of the grid for a flat surface
 
 
 @dataclass(frozen=True)
@@ -50,21 +50,20 @@ def reconstruct(
     *,
     close: bool = False,
 ) -> Mesh:
-    """Wrap particles in a surface: splashsurf's level set of their density, smoothed.
+    """Return the surface of particles: splashsurf's level set of their density, smoothed.
 
-    At the walls the particles are mirrored, so that their density does not fade there, and the mesh is cut off at
-    the wall: what touches it is flat. Vertices and triangles come in an order of their own, not in that of the
-    threads that found them. Method: Loeschner, Boettcher, Jeske, Bender (2023), Weighted Laplacian smoothing for
-    surface reconstruction of particle-based fluids.
+    At the walls the particles are mirrored, so that their density does not fade, and the mesh is cut off at the wall
+    and flat there. The order of vertices and triangles does not depend on threads. Method: Loeschner, Boettcher, Jeske,
+    Bender (2023), Weighted Laplacian smoothing for surface reconstruction of particle-based fluids.
 
-    Positions (n, 3) and the distance between neighbours at the start are in m; what is not a number or far from the
-    domain is left out. Attributes are (n,) or (n, k) finite numbers, carried over to the vertices. A `close` surface
-    keeps lumps, and single particles small: right for crumbs, not for sheets.
+    Positions (n, 3) and the distance between neighbours at the start are in m; positions that are not finite or far
+    from the domain are left out. Attributes are (n,) or (n, k) finite numbers, interpolated to the vertices. A `close`
+    surface keeps lumps and makes single particles small, which suits crumbs but not sheets.
     """
     from pysplashsurf import laplacian_smoothing_parallel, reconstruction_pipeline
 
     keep = drawable(position, lower, upper, distance)
-    # About the middle of the domain and in particle radii, where single precision is at its best.
+    # Relative to the middle of the domain and in particle radii, for best single precision.
     radius, middle = 0.5 * distance, 0.5 * (np.array(lower) + np.array(upper))
     low, high = (((np.array(corner) - middle) / radius).astype(np.float32) for corner in (lower, upper))
     particles = np.clip((position[keep] - middle) / radius, low, high).astype(np.float32)
@@ -73,7 +72,7 @@ def reconstruct(
         return empty_mesh(carried)
     points, source = with_images(particles, IMAGE_REACH, low, high)
     length, threshold, rounds = CLOSE if close else USUAL
-    # Its own clean-up and smoothing depend on the order in which threads end: ours come after the sorting.
+    # Its own clean-up and smoothing depend on the order of threads; ours follow after sorting.
     surface, _ = reconstruction_pipeline(
         points,
         attributes_to_interpolate={name: np.ascontiguousarray(values[source]) for name, values in carried.items()},
@@ -82,7 +81,7 @@ def reconstruct(
         cube_size=CUBE,
         iso_surface_threshold=threshold,
         multi_threading=True,
-        # In vectors the sums of two subdomains over the particles of one node differ in their last bit.
+        # With vector instructions the sums of two subdomains at one node differ in the last bit.
         simd=False,
         subdomain_grid=True,
         subdomain_grid_auto_disable=False,
@@ -103,7 +102,7 @@ def reconstruct(
     vertices[:], faces[:] = vertices[order], triangles
     weights, connectivity = _fullness(points, vertices), mesh.vertex_vertex_connectivity()
     laplacian_smoothing_parallel(mesh, connectivity, iterations=rounds, beta=1.0, weights=weights)
-    # The old view is stale: smoothing has put other memory in its place.
+    # The old view is stale: smoothing has replaced its memory.
     raw = np.asarray(mesh.vertices)
     vertices = np.clip(raw, low, high)
     kept = _area_vectors(vertices, triangles).any(axis=1)
@@ -143,7 +142,7 @@ def _area_vectors(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 def _pressed_flat(
     raw: np.ndarray, triangles: np.ndarray, particles: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> np.ndarray:
-    """Return which triangles (t,) are those of an image that its particle, close to a wall, does not touch.
+    """Return which triangles (t,) belong to the image of a particle that is close to a wall but does not touch it.
 
     Cut off at the wall, such an image is a sheet without thickness that lies on it. Vertices (v, 3) are `raw`, in
     radii, before they are cut off; particles (n, 3) are without images.
@@ -161,9 +160,9 @@ def _pressed_flat(
 
 
 def _fullness(points: np.ndarray, vertices: np.ndarray) -> np.ndarray:
-    """Return weights (v,) of smoothing: 1 where particles (m, 3) fill half of the room, 0 where they are alone.
+    """Return weights (v,) of smoothing: 1 where particles (m, 3) fill half of the space, 0 where they are isolated.
 
-    Lengths are in particle radii. Smoothing would pull a drop of one particle together to a point.
+    Lengths are in particle radii. Smoothing would shrink a drop of one particle to a point.
     """
     low = vertices.min(axis=0).astype(np.float64)
     size = np.ptp(vertices, axis=0) + 1.0
@@ -190,7 +189,7 @@ def surface_paths(scene: RenderScene, directory: Path, index: int) -> list[Path]
 
 
 def slug(name: str) -> str:
-    """Return a name as a part of the name of a file: small letters, digits and underlines."""
+    """Return a name as part of a file name: lower-case letters, digits and underscores."""
     return re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_") or "material"
 
 
@@ -198,7 +197,7 @@ def save_surface(scene: RenderScene, frame: Frame, directory: Path) -> list[Path
     """Write the surface of every material of a frame, `surface_<material>_<frame>.vtp` and `.obj`; return the paths.
 
     A material without particles in the domain has a file without points, so that a series has no gaps. Lengths are
-    metres; in 2D the surfaces are triangles at z = 0, seen from above. The directory is made if there is none.
+    metres; in 2D the surfaces are triangles at z = 0, seen from above. The directory is created if missing.
     """
     try:
         directory.mkdir(parents=True, exist_ok=True)
@@ -230,13 +229,13 @@ def write_series(scene: RenderScene, directory: Path, frames: Sequence[tuple[int
 
 @dataclass(frozen=True)
 class SurfaceJob:
-    """The surfaces of frames of a result, as a process of its own writes them."""
+    """Writes the surfaces of frames of a result in a worker process."""
 
     source: Path
     directory: Path
 
     def start(self) -> Callable[[int], None]:
-        """Open the result, and return what writes the surfaces of a frame."""
+        """Open the result, and return the function that writes the surfaces of a frame."""
         result = open_result(self.source)
         scene = render_scene_of(result)
 
@@ -258,7 +257,7 @@ def flat_mesh(position: np.ndarray, distance: float, lower: Sequence[float], upp
     """Return triangles at z = 0 that fill what particles (n, 2) cover by more than a half; see `reconstruct`."""
     low, high = np.array(lower[:2]), np.array(upper[:2])
     spare = 3.0 * distance
-    # From wall to wall, but not where there is nothing.
+    # From wall to wall, but without empty space.
     first = np.maximum(position.min(axis=0) - spare, low)
     last = np.minimum(position.max(axis=0) + spare, high)
     edge = max(distance / FINENESS, float(np.sqrt(np.prod(last - first) / NODES)))

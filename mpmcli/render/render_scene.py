@@ -1,4 +1,4 @@
-"""The scene of a picture: the domain of a run, or of one to come, its materials, and particles drawn as one body."""
+"""The scene of a picture: the domain of a run or of a scene, its materials, and groups of particles."""
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -36,16 +36,16 @@ Finish = Literal["water", "syrup", "translucent", "crumbly", "grains", "metal", 
 class Appearance:
     """The appearance of one material; colours are "#rrggbb"."""
 
-    name: str  # of the preset that it is nearest to, or of its law
+    name: str  # name of the nearest preset, or of its law
     color: str  # of the lit surface
-    ink: str  # of dots and legends: distinguishable from every other on a light and on a dark background
+    ink: str  # of dots and legends: distinguishable from all others on a light and on a dark background
     finish: Finish
-    liquid: bool = False  # flows as one body, so that dots hide what it is
+    liquid: bool = False  # flows as one body, which dots do not show
     label: str = ""  # in legends, in place of the name
 
     @property
     def title(self) -> str:
-        """What legends and names of files call it."""
+        """Its name in legends and file names."""
         return self.label or self.name
 
 
@@ -61,11 +61,11 @@ APPEARANCES = {
     "clay": Appearance("clay", "#b8694a", "#c4704e", "matte"),
     "metal": Appearance("metal", "#a4acb6", "#8a95a3", "metal"),
 }
-# Laws without a preset, in the order in which they come.
+# Colours of laws without a preset, in the order of appearance.
 OTHERS = ("#0f9d8a", "#c2569b", "#7d8a2e", "#4e6fb8", "#b0563c")
-UNSEEN = {"law", "surface_friction"}  # parameters that say nothing of what a material looks like
+UNSEEN = {"law", "surface_friction"}  # parameters that do not affect the look of a material
 ALIKE = 1e-12  # distance of materials below which they are the same
-PARALLEL = 0.9  # cosine above which an axis is too near to that of a rotation to be an arm
+PARALLEL = 0.9  # cosine above which an axis is too close to that of a rotation to serve as an arm
 NOTHING_YET = dict.fromkeys(("kinetic", "elastic", "potential", "mass", "speed_max", "courant_max"), 0.0)
 LOAD_TIMES = 32  # times of a run at which loads are evaluated
 COHERENT = 0.5  # least ratio of a resultant to the sum of the magnitudes of forces: a vortex has no arrow
@@ -90,7 +90,7 @@ def appearance_of(law: str, parameters: dict[str, Any], others: int = 0) -> Appe
 
 
 def _distance(preset: dict[str, Any], parameters: dict[str, Any]) -> float:
-    """Return how far apart two sets of parameters are: the sum of the squared logarithms of their ratios."""
+    """Return the distance of two sets of parameters: the sum of the squared logarithms of their ratios."""
     total = 0.0
     for name, wanted in preset.items():
         given = parameters.get(name)
@@ -122,7 +122,7 @@ class RenderScene:
     collider_frames: tuple[int, ...] | None = None  # the frame that each collider is in; None where all are in all
     hollow: tuple[int, ...] = ()  # numbers of the colliders in 3D that are cut open, so that what is inside is seen
     towards: tuple[float, ...] = (0.0, 0.0, 0.0)  # the direction (3,) from which they are cut
-    faces: tuple[tuple[str, str], ...] = ()  # words of the walls of each axis; none where they are not known
+    faces: tuple[tuple[str, str], ...] = ()  # conditions of the walls of each axis; empty if unknown
     clear: bool = False  # colliders in 3D show only their far sides, as containers do, so that they hide nothing
 
     def shows(self, number: int, frame: Frame) -> bool:
@@ -131,15 +131,15 @@ class RenderScene:
 
 
 def render_scene_of(result: Result) -> RenderScene:
-    """Read the scene of a result from its header; InputError where that lacks the domain."""
+    """Read the scene of a result from its header; InputError: it lacks the domain."""
     header, d = result.header, result.dimension
     if header.origin is None or not header.spacing:
-        raise InputError(f"{result.path} does not say what its domain is, so that no picture can be framed.")
+        raise InputError(f"{result.path} has no domain in its header, so that no picture can be framed.")
     bodies = header.bodies or (BodyHeader("all", {}, None, usual_particles_per_cell(d)),)
     names = tuple(one_line(body.name) for body in bodies)
     appearances, material_of = _materials(names, [body.material for body in bodies])
     flat, up, gravity = [0.0] * (3 - d), np.zeros(3), header.steady_gravity
-    # In 2D, and where there is no gravity, the last axis is upwards.
+    # In 2D, and without gravity, the last axis is upwards.
     up[d - 1] = 1.0
     if d == 3 and gravity is not None and gravity.any():
         axis = int(np.argmax(np.abs(gravity)))
@@ -157,7 +157,7 @@ def render_scene_of(result: Result) -> RenderScene:
         distances=tuple(header.spacing / body.particles_per_cell ** (1 / d) for body in bodies),
         densities=tuple(body.density or 1000.0 for body in bodies),
         faces=header.faces,
-        # What holds a part is no thing to be seen.
+        # A collider that holds material is not visible.
         colliders=tuple(result.colliders[k] for k in shown),
         held=tuple(collider for collider in result.colliders if collider.holds),
         collider_frames=result.collider_frames and tuple(result.collider_frames[k] for k in shown),
@@ -181,7 +181,7 @@ def _materials(
             firsts.append(body)
     names = [appearance.name for appearance in appearances]
     for k, (name, body) in enumerate(zip(names, firsts, strict=True)):
-        # A viscous water may look most like honey, and is none.
+        # A viscous water may be nearest to honey but is not honey.
         exact = name in PRESETS and _distance(PRESETS[name].parameters, dict(kinds[k])) < ALIKE
         if not exact or names.count(name) > 1:
             appearances[k] = replace(appearances[k], label=f"{name} ({body})" if exact else body)
@@ -190,9 +190,9 @@ def _materials(
 
 @dataclass(frozen=True)
 class Group:
-    """Particles that are drawn as one body: those of one liquid, or those of one solid body."""
+    """Particles drawn as one body: those of one liquid, or of one solid body."""
 
-    key: tuple[int, int]  # the material, and the body where bodies of one material stay apart
+    key: tuple[int, int]  # the material, and the body if bodies of one material are separate
     appearance: Appearance
     rows: np.ndarray  # (n,) of the frame
     position: np.ndarray  # (n, d) float64, m
@@ -200,12 +200,12 @@ class Group:
 
     @property
     def hashes(self) -> np.ndarray:
-        """Three numbers from -1 to 1 of each particle, (n, 3) float32: always the same of the same row."""
+        """Three numbers from -1 to 1 for each particle, (n, 3) float32, fixed for each row."""
         return np.random.default_rng(1).uniform(-1.0, 1.0, (self.rows.max() + 1, 3)).astype(np.float32)[self.rows]
 
 
 def groups_of(scene: RenderScene, frame: Frame) -> list[Group]:
-    """Return the groups of a frame that have particles to be drawn, in the order of materials and bodies."""
+    """Return the groups of a frame with particles to draw, in the order of materials and bodies."""
     material_of, distances = np.array(scene.material_of), np.array(scene.distances)
     body = np.clip(frame.body, 0, len(material_of) - 1)
     sound = drawable(frame.position, scene.lower, scene.upper, max(scene.distances))
@@ -224,7 +224,7 @@ def groups_of(scene: RenderScene, frame: Frame) -> list[Group]:
 def result_of_start(scene: Scene) -> Iterator[tuple[Result, tuple[Arrow, ...]]]:
     """Yield the start of a scene as a result, in a directory that is removed afterwards, its velocities and its loads.
 
-    Of each emitter the first layer is there. Raises InputError as `sample_bodies` does.
+    It includes the first layer of each emitter. Raises InputError as `sample_bodies` does.
     """
     sources, found, d = scene.sources, sample_bodies(scene), scene.dimension
     names = sorted({source.material.law for source in sources})
@@ -293,7 +293,7 @@ def _loads(scene: Scene, found: Sequence[BodyParticles]) -> Iterator[tuple[np.nd
 
 
 def _motion_of(collider: Collider, d: int) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return places of a collider and their velocities at the start: its pivot, and its rim where it turns."""
+    """Return points of a collider and their initial velocities: its pivot, and its rim if it rotates."""
     pivot = collider.motion.pose(0.0)[0]
     if collider.free:
         velocity = np.array(collider.rates[:d])

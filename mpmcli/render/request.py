@@ -1,4 +1,4 @@
-"""The options of `mpmcli render`, validated before anything is drawn, and the plan that carries them out."""
+"""The options of `mpmcli render`, validated before drawing, and the plan that executes them."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -42,7 +42,7 @@ COLORED = ("dots", "surface")  # modes in which particles have the colours of a 
 
 @dataclass(frozen=True)
 class Request:
-    """The options of the command, as they were given; None where they were not."""
+    """The options of the command as given; None if omitted."""
 
     output: Path | None = None
     mode: Mode = "dots"
@@ -69,12 +69,12 @@ class Request:
 
 @dataclass(frozen=True)
 class RenderSummary:
-    """What carrying out a plan produced."""
+    """The outcome of a plan."""
 
     pictures: list[Path]  # files, by frame; the one of a montage
-    made: int  # number of them that were drawn now
+    made: int  # number of files drawn by this plan
     film: Path | None  # None for pictures only
-    surfaces: Path | None  # the directory of the surfaces, None where none was asked for
+    surfaces: Path | None  # the directory of the surfaces, None if not requested
     warnings: list[str]  # sentences
 
     @property
@@ -83,7 +83,7 @@ class RenderSummary:
         return [*([self.film] if self.film else self.pictures), *([self.surfaces] if self.surfaces else [])]
 
     def as_dict(self) -> dict[str, Any]:
-        """Return it in the form of JSON."""
+        """Return it for JSON."""
         pictures, film = [str(path) for path in self.pictures], str(self.film) if self.film else None
         return {"pictures": pictures, "made": self.made, "film": film, "warnings": self.warnings}
 
@@ -99,7 +99,7 @@ class RenderPlan:
 
     @property
     def due(self) -> int:
-        """Number of frames that have to be drawn, or their surfaces written."""
+        """Number of frames to draw, or to write surfaces for."""
         frames = len(self.ks) if self._is_montage else 1
         return sum(frames for planned in self.plan if not planned.made) + len(self.ks) * bool(self.request.save_surface)
 
@@ -114,10 +114,10 @@ class RenderPlan:
         watch: Callable[[int], None] = lambda done: None,
         stop: Callable[[], bool] = lambda: False,
     ) -> RenderSummary:
-        """Draw the missing pictures, in as many processes as cores for None, and write the film.
+        """Draw the missing pictures, in `workers` processes, None for one per core, and write the film.
 
-        `watch` is called with the number of frames drawn so far; `stop` is polled, and true ends the work by a
-        KeyboardInterrupt, finished pictures stay. InputError: no OpenGL window opens on this machine, or a file cannot
+        `watch` is called with the number of frames drawn so far; `stop` is polled, and True ends the work by a
+        KeyboardInterrupt; finished pictures stay. InputError: no OpenGL window opens on this machine, or a file cannot
         be written; RunError: a process crashed, or the disk is full.
         """
         workers = workers or available_cores()
@@ -173,9 +173,9 @@ class RenderPlan:
 
 
 def plan_render(result: Result, request: Request, captions: tuple[str, ...] = ()) -> RenderPlan:
-    """Validate a request and return the plan that carries it out; InputError where it is not possible.
+    """Validate a request and return its plan; InputError: it is impossible.
 
-    `captions` are of the frames of the result in a montage; empty for their times.
+    `captions` are those of the frames of the result in a montage; empty for their times.
     """
     _require_sense(request)
     if request.movie is not None:
@@ -222,7 +222,7 @@ def plan_render(result: Result, request: Request, captions: tuple[str, ...] = ()
 
 def _require_sense(request: Request) -> None:
     if request.movie and request.montage:
-        raise InputError("--movie and --montage are two things: ask for one after the other.")
+        raise InputError("--movie and --montage exclude each other: give one of them.")
     if request.fps is not None and not request.movie:
         raise InputError("--fps is the rate of a film: name one with --movie.")
     if request.save_surface and request.mode != "surface":
@@ -235,7 +235,7 @@ def _require_sense(request: Request) -> None:
         allowed = COLORED if option == "--color-by" else (*COLORED, "density")
         if value and request.mode not in allowed:
             raise InputError(
-                f"{option} says nothing in --mode {request.mode}, which has colours of its own: use --mode "
+                f"{option} has no effect in --mode {request.mode}, which has its own colours: use --mode "
                 f"{' or '.join(allowed)}."
             )
 
@@ -245,10 +245,10 @@ def _paths(result: Result, request: Request, count: int) -> Callable[[int], Path
     output, mode = request.output, request.mode
     if output is not None and output.suffix and not output.is_dir():
         if output.suffix.lower() in (".mp4", ".gif"):
-            raise InputError(f"-o {output} would be no picture: for a film, give --movie.")
+            raise InputError(f"-o {output} cannot be a picture: for a film, give --movie.")
         if output.suffix.lower() != ".png":
             hint = "pictures are .png, and a directory with a dot has to be there"
-            raise InputError(f"-o {output} would be no picture: {hint}.")
+            raise InputError(f"-o {output} cannot be a picture: {hint}.")
         if count > 1 and not request.montage:
             raise InputError(f"-o {output} is one picture and {count} were asked for: name a directory.")
         return lambda k: output

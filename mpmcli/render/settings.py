@@ -14,11 +14,11 @@ COLLIDERS: tuple[Colliders, ...] = ("auto", "solid", "clear", "none")
 # A place, m, a vector there relative to the longest of its kind, each (d,), and its magnitude with the unit.
 Arrow = tuple[tuple[float, ...], tuple[float, ...], str]
 ThemeName = Literal["light", "dark"]
-# Pixels along a side, and in all: more would not fit into the memory of a renderer.
+# Limits of the pixels along a side, and in total, by the memory of a renderer.
 SIDE_MIN, SIDE_MAX = 64, 16_384
 PIXELS_MAX = 64_000_000
-# Largest limit of colours and least distance between two, well within double precision; least distance relative to the
-# limits, as closer ones round to the same number.
+# Largest limit of colours and smallest distance between two, well within double precision; smallest distance relative
+# to the limits, because closer ones round to the same number.
 LIMIT_MAX, LIMIT_MIN, NARROWEST = 1e300, 1e-300, 1e-12
 GRID_MAX = 20  # pictures in a montage, along each side
 
@@ -28,15 +28,15 @@ class Settings:
     """Everything that a picture depends on, except the frame."""
 
     mode: Mode
-    color: str | None  # as `--color-by`; None for the usual one of dots, and for materials as they look
-    # Of the whole picture, pixels; None for a size, or a height, that follows from the scene.
+    color: str | None  # as `--color-by`; None for the default of dots, and for natural colours of materials
+    # Size of the whole picture, pixels; None for a size, or a height, that follows from the scene.
     size: tuple[int, int | None] | None
     camera: str = "iso"
     theme: str = "light"
-    limits: tuple[float, float] | None = None  # of the colours, None where they have none
+    limits: tuple[float, float] | None = None  # limits of the colours, None if they have none
     cmap: str | None = None  # colour map of matplotlib, None for the one that suits the values
     grid: tuple[int, int] = (1, 1)  # columns and rows of a montage, (1, 1) for a picture of one frame
-    # "clear": in 3D only their far sides are drawn, as those of containers are; "auto": hollow ones are cut open.
+    # "clear": in 3D only their far sides are drawn, as for containers; "auto": hollow ones are cut open.
     colliders: Colliders = "auto"
     arrows: tuple[Arrow, ...] | None = None  # of the start of a scene, whose held parts are shown; None for a result
 
@@ -49,7 +49,7 @@ class Theme:
     ground: str  # background of the picture, and behind the particles in 2D
     sky: str  # of the background of a 3D scene, above; `horizon` below
     horizon: str
-    floor: str  # what shadows fall on
+    floor: str  # surface under shadows
     text: str  # titles and numbers; `faint`: secondary marks
     faint: str
     wall: str  # lines of the domain; `solid`: colliders
@@ -74,7 +74,7 @@ def rgb(color: str) -> tuple[float, ...]:
 
 
 def lighter(color: str, share: float) -> str:
-    """Return a colour "#rrggbb" mixed with this share of white."""
+    """Return a colour "#rrggbb" mixed with the given fraction of white."""
     return "#" + bytes(round(part + share * (255 - part)) for part in rgb_bytes(color)).hex()
 
 
@@ -82,14 +82,14 @@ def parse_size(text: str) -> tuple[int, int | None]:
     """Read "1280x720", or "1280xauto" for a height that follows from the scene: None; InputError for anything else."""
     match = re.fullmatch(r"(\d{1,9})[xX](\d{1,9}|auto)", text.strip())
     if not match:
-        raise InputError(f'--size "{text}" is no size: give width and height in pixels, such as 1280x720 or 1280xauto.')
+        raise InputError(f'--size "{text}" is not a size: give width and height, such as 1280x720 or 1280xauto.')
     width, height = int(match[1]), None if match[2] == "auto" else int(match[2])
     require_possible(width, height or width, text)
     return width, height
 
 
 def require_possible(width: int, height: int, text: str) -> None:
-    """Raise InputError for a size that no picture can have; `text` is the option as given."""
+    """Raise InputError for an impossible size of a picture; `text` is the option as given."""
     if not (min(width, height) >= SIDE_MIN and max(width, height) <= SIDE_MAX and width * height <= PIXELS_MAX):
         raise InputError(
             f"--size {text} is not possible: a side has {SIDE_MIN} to {SIDE_MAX} pixels, and a picture at most "
@@ -113,7 +113,7 @@ def parse_limits(text: str) -> tuple[float, float]:
     except ValueError:
         low = high = math.nan
     if not (math.isfinite(low) and math.isfinite(high) and low < high):
-        raise InputError(f'--clim "{text}" is no range: give the lower and the upper limit, such as 0,2.5.')
+        raise InputError(f'--clim "{text}" is not a range: give the lower and the upper limit, such as 0,2.5.')
     if max(-low, high) > LIMIT_MAX or not high - low >= max(LIMIT_MIN, NARROWEST * max(abs(low), abs(high))):
         raise InputError(f'--clim "{text}" is too wide or too narrow for colours: give limits such as 0,2.5.')
     return low, high

@@ -1,4 +1,4 @@
-"""Draws 3D surfaces in one off-screen window, its meshes replaced with every frame."""
+"""Draws 3D surfaces in one off-screen window whose meshes are replaced with every frame."""
 
 import math
 from collections.abc import Sequence
@@ -20,14 +20,14 @@ from mpmcli.render.render_scene import Appearance, Group, RenderScene, groups_of
 from mpmcli.render.settings import Theme, rgb
 from mpmcli.render.view import View
 
-# Pixels of the window to one of the picture, along each axis, and the longest side of a window.
+# Pixels of the window per pixel of the picture, along each axis, and the longest side of a window.
 FINER, LONGEST = 2, 8192
-# Edge of the cells in which the thickness of a body is found, in distances between particles, and the least, pixels.
+# Edge of the cells for the thickness of a body, in distances between particles, and the smallest edge, pixels.
 COARSENESS, FINEST = 1.4, 3.0
-# Radius of the ball of a grain, in distances between particles: a little more than half, so that a heap has no holes.
+# Radius of the ball of a grain, in distances between particles: slightly above half, so that a heap has no holes.
 RADIUS = 0.6
-VARIETY = 0.26  # by how much grains differ in brightness, as a share
-JITTER = 0.3  # by how much a grain is moved, in distances between particles: heaps are no lattices
+VARIETY = 0.26  # relative variation of brightness of grains
+JITTER = 0.3  # random displacement of a grain, in distances between particles, because heaps are not lattices
 
 
 class SurfaceRenderer:
@@ -65,7 +65,7 @@ class SurfaceRenderer:
             self._pose_solid(mesh, shown, frame.time, occlusion)
         _put(self.background_texture, self.background.image(occlusion))
         if clear:
-            # What is clear shows the picture of all the rest.
+            # Clear bodies show the picture of all others.
             for actor in clear:
                 actor.SetVisibility(False)
             self.window.render()
@@ -95,7 +95,7 @@ class SurfaceRenderer:
         tint = lighting.linear(group.appearance.color)
         if self.colors is not None:
             value, known = (mesh.attributes[name].astype(np.float64) for name in ("value", "known"))
-            # The mean over those particles that have a number, where they are the majority.
+            # The mean over the particles with a number, if they are the majority.
             mean = np.divide(value, known, out=np.full_like(value, np.nan), where=known > 0.5)
             tint = (self.colors.rgb(mean) / 255.0) ** 2.2
         thick = 0.0
@@ -105,7 +105,7 @@ class SurfaceRenderer:
         return _carry(self.actors[group.key], occlusion, mesh.points, mesh.triangles, mesh.normals, looks)
 
     def _posed_grains(self, group: Group, frame: Frame, occlusion: Occlusion) -> Any:
-        """Return the actor of a group of loose grains: balls for particles, each a little lighter or darker."""
+        """Return the actor of a group of loose grains: balls for particles, each slightly lighter or darker."""
         import pyvista as pv
 
         if group.key not in self.actors:
@@ -115,7 +115,7 @@ class SurfaceRenderer:
         color, hashes = np.array(rgb(group.appearance.color)), group.hashes
         if self.colors is not None:
             color = self.colors.particle_rgb(frame)[group.rows] / 255.0
-            # A colour that means something is not varied.
+            # A colour that represents a value is not varied.
             hashes = np.zeros_like(hashes)
         lamp, sky = occlusion.at(group.position, np.array(self.scene.up))
         light = 0.42 + 0.34 * lamp + 0.30 * sky
@@ -133,7 +133,7 @@ class SurfaceRenderer:
         return actor
 
     def _pose_solid(self, mesh: ColliderMesh, shown: Any, time: float, occlusion: Occlusion) -> None:
-        """Put a collider where it is at a time, s, in the light there."""
+        """Move a collider to its position at a time, s, and light it."""
         color, key, matrix = self.theme.solid, ("collider", mesh.number), mesh.transform(time)
         if key not in self.actors:
             look = Appearance("collider", color, color, "matte")
@@ -141,7 +141,7 @@ class SurfaceRenderer:
             if self.scene.clear and mesh.casts:
                 self.actors[key].GetProperty().BackfaceCullingOff()
                 self.actors[key].GetProperty().FrontfaceCullingOn()
-            # The rims of a container stand for its near side, which is not seen.
+            # The rims of a container represent its near side, which is invisible.
             inside = mesh.collider.side == "inside"
             self.rims[mesh.number] = edge_actors(mesh, self.theme, self.window) if inside else []
         for rim in self.rims[mesh.number]:
@@ -171,7 +171,7 @@ class SurfaceRenderer:
         declared, done = lighting.fragment_code(
             self.scene, self.view, self.theme, appearance, self.window.samples, by_field=by_field, walled=walled
         )
-        # After all that the window does itself; its own lights and textures are left out.
+        # After the window's own code; its lights and textures are left out.
         shader.AddFragmentShaderReplacement("//VTK::TCoord::Dec", True, f"//VTK::TCoord::Dec\n{declared}", False)
         shader.AddFragmentShaderReplacement("//VTK::Light::Impl", True, "", False)
         shader.AddFragmentShaderReplacement("//VTK::TCoord::Impl", True, done, False)
@@ -187,7 +187,7 @@ def _carry(
     normals: np.ndarray,
     looks: Sequence[Any],
 ) -> Any:
-    """Give an actor a mesh whose vertices hand light, tint, thickness and roughness, the `looks`, to the shader."""
+    """Give an actor a mesh whose vertices pass light, tint, thickness and roughness, the `looks`, to the shader."""
     import pyvista as pv
 
     data = pv.PolyData.from_regular_faces(points, triangles) if len(points) else pv.PolyData()
@@ -198,7 +198,7 @@ def _carry(
     for name, values in zip(lighting.CARRIED, (light, tint, rough, normals), strict=True):
         columns = 4 if name == lighting.LIGHT else 3
         data.point_data[name] = np.array(np.broadcast_to(values, (len(points), columns)), dtype=np.float32)
-    # Only because the window declares textures of meshes that have these.
+    # Needed only because the window declares textures for meshes with these coordinates.
     data.point_data["places"] = np.zeros((len(points), 2), dtype=np.float32)
     data.GetPointData().SetActiveTCoords("places")
     actor.GetMapper().SetInputData(data)
@@ -207,7 +207,7 @@ def _carry(
 
 
 def _thickness_at(view: View, position: np.ndarray, distance: float, points: np.ndarray) -> np.ndarray:
-    """Return the length (v,) of body that a ray through each of the points (v, 3) meets, m.
+    """Return the length (v,) of a body along a ray through each of the points (v, 3), m.
 
     Particles (n, 3) are counted in coarse cells of the picture: their volume over the area of a cell at their depth.
     """
@@ -236,7 +236,7 @@ def _put(texture: Any, picture: np.ndarray) -> None:
 
 
 def _new_grains(view: View, lamp: np.ndarray, distance: float) -> Any:
-    """Return an actor without grains, whose balls are lit from the side of the lamp."""
+    """Return an actor without grains, whose balls are lit by the lamp."""
     import vtk
 
     mapper = vtk.vtkPointGaussianMapper()

@@ -13,11 +13,13 @@ if TYPE_CHECKING:
     import pyvista as pv
 
 CAMERAS = ("iso", "front", "side", "top")
-ANGLE = 24.0  # full vertical angle of a perspective view, degrees: a long lens distorts little
+ANGLE = 24.0  # full vertical angle of a perspective view, degrees; small for little distortion
 MARGIN = 0.04  # margin around the domain on each side, as a fraction of the picture
 AZIMUTH, ELEVATION = 32.0, 24.0  # angles of the camera "iso" to the right of the front and above the ground, degrees
 SQUARE = 1000  # pixels along the sides of the auxiliary picture that gives the aspect ratio
-FARTHEST = 1e5  # largest distance of a camera, in sizes of the domain, which then covers a hundredth of a pixel
+FARTHEST = (
+    1e5  # largest distance of a camera, in sizes of the domain, at which the domain covers a hundredth of a pixel
+)
 CENTRING_ROUNDS = 8  # iterations that centre the projected domain in the picture
 
 
@@ -30,7 +32,7 @@ class View:
     focus: tuple[float, ...]  # (3,), m
     up: tuple[float, ...]  # direction (3,)
     height: float  # length at the focus that the full height of the picture shows, m
-    parallel: bool  # parallel projection, in which a scale bar has a meaning
+    parallel: bool  # parallel projection, for which a scale bar is valid
     near: float  # distances from the camera between which the domain lies, m
     far: float
 
@@ -41,7 +43,7 @@ class View:
 
     @property
     def pixels_per_metre(self) -> float:
-        """Pixels to the metre, at the focus where the view is in perspective."""
+        """Pixels per metre, in a perspective view at the focus."""
         return self.size[1] / self.height
 
     @property
@@ -58,22 +60,22 @@ class View:
         return np.stack([0.5 * width + right * scale, 0.5 * height - up * scale, depth], axis=1)
 
     def scale_at(self, distance: np.ndarray) -> np.ndarray:
-        """Return pixels to the metre at distances from the camera, m."""
+        """Return pixels per metre at distances from the camera, m."""
         if self.parallel:
             return np.full(np.shape(distance), self.pixels_per_metre)
         return self.pixels_per_metre * self.distance / distance
 
     def plane(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return how far places x and y, pixels from the left and the top, lie to the right and up of the middle.
+        """Return the coordinates to the right and up from the middle of positions x and y, pixels from left and top.
 
-        In metres, or in a perspective view in metres at a distance of 1 m.
+        They are in metres, in a perspective view in metres at a distance of 1 m.
         """
         width, height = self.size
         unit = 1 / self.pixels_per_metre if self.parallel else 1 / (self.pixels_per_metre * self.distance)
         return (x - 0.5 * width) * unit, (0.5 * height - y) * unit
 
     def rays(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return starts and directions (..., 3) of lines of sight, in the scene: start + z * direction is z away."""
+        """Return starts and directions (..., 3) of lines of sight in the scene: start + z * direction has depth z."""
         across, up = self.plane(x, y)
         right, rise, back = self.axes
         offset = across[..., None] * right + up[..., None] * rise
@@ -95,8 +97,8 @@ class View:
 def view_of(scene: RenderScene, camera: str, size: tuple[int, int]) -> View:
     """Return the view of the domain of a run from a camera.
 
-    A camera is one of `CAMERAS`, or six numbers with commas between: where it stands and what it looks at, m. A 2D
-    scene is always looked at from the front. InputError where it is none of these, or not for a scene in 2D.
+    A camera is one of `CAMERAS`, or six comma-separated numbers: its position and its target, m. A 2D scene is always
+    seen from the front. InputError: it is none of these, or is not for a 2D scene.
     """
     if scene.dimension == 2 and camera not in ("iso", "front"):
         raise InputError(f"--camera {camera} is for scenes in 3D: this one is in 2D, and drawn in its plane.")
@@ -130,7 +132,7 @@ class Slice:
 
 
 def slice_of(scene: RenderScene, camera: str) -> Slice:
-    """Return the plane in the middle of the domain that a camera looks at from the front; "iso" as "front"."""
+    """Return the plane in the middle of the domain that a camera faces; "iso" as "front"."""
     if scene.dimension == 2:
         return Slice((0, 1))
     up = int(np.argmax(np.abs(scene.up)))
@@ -140,7 +142,7 @@ def slice_of(scene: RenderScene, camera: str) -> Slice:
 
 
 def aspect_of(scene: RenderScene, camera: str) -> float:
-    """Return the height of the domain over its width, as a camera sees it, with the margin around it."""
+    """Return the ratio of height to width of the domain as seen by a camera, with the margin around it."""
     view = view_of(scene, camera, (SQUARE, SQUARE))
     width, height = np.ptp(view.pixels(corners_of(scene))[:, :2], axis=0) + 2 * MARGIN * SQUARE
     return float(height / width)
@@ -160,7 +162,7 @@ def corners_of(scene: RenderScene) -> np.ndarray:
 
 
 def _framed(scene: RenderScene, back: np.ndarray, up: np.ndarray, size: tuple[int, int], *, parallel: bool) -> View:
-    """Return the nearest view from a direction in which the whole domain is seen, its projection in the middle."""
+    """Return the nearest view from a direction that shows the whole domain, with its projection centred."""
     corners, axes = corners_of(scene), _axes(back, up)
     focus = corners.mean(axis=0)
     room = 1.0 - 2.0 * MARGIN
@@ -190,16 +192,16 @@ def _free_view(scene: RenderScene, camera: str, size: tuple[int, int]) -> View:
         numbers = np.empty(0)
     what = f'--camera "{camera}" is not a camera: give {", ".join(CAMERAS)}, or six numbers x,y,z,x,y,z in metres'
     if len(numbers) != 6 or not np.isfinite(numbers).all():
-        raise InputError(f"{what}, where it stands and what it looks at.")
+        raise InputError(f"{what}, its position and its target.")
     low, high = np.array(scene.lower), np.array(scene.upper)
     if np.abs(numbers.reshape(2, 3) - 0.5 * (low + high)).max() > FARTHEST * (high - low).max():
         raise InputError(f"{what}: this one is too far from the domain for anything to be seen.")
     position, focus = numbers[:3], numbers[3:]
     back, up = position - focus, np.array(scene.up)
     if np.linalg.norm(back) <= 1e-9 * max(np.abs(numbers).max(), 1e-300):
-        raise InputError(f"{what}: this one looks at where it stands.")
+        raise InputError(f"{what}: its position and its target are equal.")
     if np.linalg.norm(np.cross(back, up)) <= 1e-6 * np.linalg.norm(back):
-        # Looking straight up or down, any other direction serves as the upward one.
+        # For a vertical line of sight any other direction serves as the upward one.
         up = np.eye(3)[(int(np.argmax(np.abs(up))) + 1) % 3]
     height = 2 * math.tan(math.radians(0.5 * ANGLE)) * float(np.linalg.norm(back))
     return _view(scene, size, (position, focus, up), height, parallel=False)

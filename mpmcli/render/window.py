@@ -1,4 +1,4 @@
-"""The OpenGL window with which VTK draws without a screen."""
+"""Selects the OpenGL window class for VTK's off-screen drawing."""
 
 import ctypes
 import os
@@ -8,15 +8,16 @@ from mpmcli.errors import InputError
 
 # Environment variable from which VTK reads the class of its windows.
 SETTING = "VTK_DEFAULT_OPENGL_WINDOW"
-# VTK takes the second where the first cannot be had, and ends the process at the first picture without its library.
+# VTK falls back to the second if the first is not available, and ends the process at the first picture if its library
+# is missing.
 EGL, OSMESA = "vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow"
 OSMESA_LIBRARIES = ("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so")
 
 
 def choose_window() -> str:
-    """Return the class of window that VTK draws with off screen, here and in processes started from here.
+    """Return the class of VTK's off-screen window, for this process and its children.
 
-    The user's VTK_DEFAULT_OPENGL_WINDOW is kept. Otherwise it is EGL on Linux, or OSMesa where EGL does not work.
+    The user's VTK_DEFAULT_OPENGL_WINDOW is kept. Otherwise it is EGL on Linux, or OSMesa if EGL does not work.
     InputError: no window opens.
     """
     given = os.environ.get(SETTING, "").strip()

@@ -1,4 +1,4 @@
-"""What a scene can reach, from its initial state alone: the highest speed, the deepest column, the densest body."""
+"""Bounds on speed, depth and density that a scene can reach, computed from its initial state alone."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -15,11 +15,12 @@ from mpmcli.scene.quadrature import parts_of
 from mpmcli.scene.sampling import estimate_body, initial_motion, moves_unevenly, particle_places
 from mpmcli.scene.schema import Body, Emitter, Force, Scene
 
-# Equal parts of a run beside those in which what depends on time alone varies, and parts at most.
+# Number of equal parts of a run, in addition to those in which a time-dependent term varies; largest number of parts.
 SLICES, MOST_SLICES = 32, 400
-# Cells along each axis of the lattice in 2D and 3D, and how often those that may hold more are halved; at most so many.
+# Cells along each axis of the lattice in 2D and 3D, the number of times that cells with a larger possible value are
+# halved, and the largest number of such cells.
 CELLS, HALVINGS, MOST_CELLS = {2: 16, 3: 8}, 10, 4096
-# Particles of a body that are looked at.
+# Largest number of particles of a body that are examined.
 MOST_PLACES = 4096
 # Instants at which cells are halved: those of the strongest forces.
 SEARCHED = 3
@@ -35,9 +36,9 @@ class Drive:
 
 @dataclass(frozen=True)
 class Slices:
-    """Lengths of parts of a run, (n,), s, in which no pulse hides; times, (m,), s, to look at; the part of each, (m,).
+    """Lengths of parts of a run, (n,), s, that resolve every pulse; sample times, (m,), s; the part of each, (m,).
 
-    The times are the middle of each part, and where what depends on time alone is largest in it.
+    The times are the middle of each part, and the time at which the terms that depend on time alone are largest in it.
     """
 
     lengths: np.ndarray
@@ -61,7 +62,7 @@ def slices_of(entries: tuple[Entry, ...], end: float) -> Slices:
         each = np.arange(len(parts.low))
         for node in (parts.values.argmax(axis=1), parts.values.argmin(axis=1)):
             times = parts.times()[each, node]
-            # Of more parts than are looked at, those with the largest values.
+            # If there are too many parts, keep those with the largest values.
             peaks.append(times[np.argsort(-np.abs(parts.values[each, node]), kind="stable")[:MOST_SLICES]])
     found = np.unique(np.concatenate(edges))
     times = np.unique(np.concatenate([0.5 * (found[1:] + found[:-1]), *peaks]))
@@ -80,7 +81,7 @@ def _timed(tree: Tree) -> Iterator[Tree]:
 
 
 def gravity_drive(scene: Scene) -> tuple[Drive, list[np.ndarray]]:
-    """Return how strongly gravity acts, and its values, (d,), m/s^2, at instants of the run."""
+    """Return the drive of gravity, and its values, (d,), m/s^2, at instants of the run."""
     if scene.domain.steady:
         gravity = scene.domain.gravity_at(0.0)
         size = float(np.linalg.norm(gravity))
@@ -95,11 +96,11 @@ def gravity_drive(scene: Scene) -> tuple[Drive, list[np.ndarray]]:
 
 
 def force_drive(scene: Scene, body: Body, places: np.ndarray, speed: float, gravity: Drive) -> Drive:
-    """Return how strongly forces act on a body, magnitudes added up, at an initial speed (m/s) and under gravity.
+    """Return the drive of the forces on a body, magnitudes added up, at an initial speed (m/s) and under gravity.
 
-    A force of the place is looked at where particles start, (n, d), m, at most MOST_PLACES of them, and in the cells of
-    a lattice that they can reach: at most as far as they move freely under the forces of their start. Cells in which
-    interval arithmetic allows more than was found are halved, so that a narrow force is found.
+    A position-dependent force is evaluated at the start of particles, (n, d), m, at most MOST_PLACES of them, and in
+    the cells of a lattice that they can reach by free motion under the forces at their start. Cells in which interval
+    arithmetic permits a larger value than was found are halved, so that a narrow force is found.
     """
     found = [_one(scene, force, places, speed, gravity) for force in scene.forces if force.body in (None, body.name)]
     return Drive(sum(one.largest for one in found), sum(one.impulse for one in found))
@@ -119,7 +120,7 @@ def _one(scene: Scene, force: Force, places: np.ndarray, speed: float, gravity: 
     way = (speed + gravity.impulse + float(slices.largest(strongest) @ slices.lengths)) * end
     if names & set(POSITION):
         low, high = _cells(scene, places, way)
-        # At the middles of the cells that particles can reach, from wherever they started.
+        # At the centres of the cells that particles can reach from any start.
         for start in (places[0], places[-1], places[len(places) // 2]):
             there = np.array([_largest(force, t, 0.5 * (low + high), start[None]) for t in times])
             strongest = np.maximum(strongest, there)
@@ -130,7 +131,7 @@ def _one(scene: Scene, force: Force, places: np.ndarray, speed: float, gravity: 
 
 
 def _cells(scene: Scene, places: np.ndarray, way: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the corners, (n, d), m, of the cells of the lattice that something within `way` of a place meets."""
+    """Return the corners, (n, d), m, of the lattice cells within a distance `way` of any place."""
     d, domain = scene.dimension, scene.domain
     size = np.array(domain.size) / CELLS[d]
     index = grid_points(*[np.arange(CELLS[d])] * d)
@@ -148,7 +149,7 @@ def _largest(force: Force, time: float, x: np.ndarray, X: np.ndarray) -> float:
     """Return the largest finite magnitude at a time, s, of particles at x that started at X, m/s^2."""
     values = dict(zip(POSITION, x.T, strict=False)) | dict(zip(INITIAL, X.T, strict=False))
     squares = np.asarray(sum(np.square(value_of(entry, t=time, **values)) for entry in force.acceleration))
-    # What is not finite somewhere is so for no particle, or stops the run.
+    # Values that are not finite occur at no particle, or stop the run.
     return float(np.max(squares, initial=0.0, where=np.isfinite(squares))) ** 0.5
 
 
@@ -173,7 +174,7 @@ def _search(
         middle = 0.5 * (low + high)
         X = np.clip(middle, *begun)
         found = max(found, _largest(force, time, middle, X))
-        # A twentieth more is no reason to look on; nor is a place where nothing bounds the force, a pole.
+        # Stop if at most a twentieth more is possible, or if the force is unbounded (a pole).
         open_cells = np.flatnonzero((bound > 1.05 * found) & np.isfinite(bound))
         if not len(open_cells):
             break
@@ -186,20 +187,20 @@ def _search(
     return found
 
 
-# Points along each axis of a box at which the velocity of a body is looked at, 2D and 3D, corners included.
+# Points along each axis of a box at which the velocity of a body is evaluated, 2D and 3D, corners included.
 POINTS = {2: 65, 3: 17}
-# Particles up to which a body is looked at where its particles are; a larger one on a lattice.
+# Largest number of particles for which a body is evaluated at its particles; a larger body uses a lattice.
 MOST_LOOKED_AT = 500_000
 
-# Numbers whose squares, and sums of a few, are numbers.
+# Range of magnitudes whose squares, and sums of a few squares, neither underflow nor overflow.
 SQUARED = (1e-150, 1e150)
 
 
 def reaching(source: Body | Emitter, scene: Scene) -> list[Body | Emitter]:
-    """Return what can fall on a source of particles, press on it or flow around it, and the source itself.
+    """Return the sources that can fall on, press on or flow around a source of particles, and the source itself.
 
-    A solid that rests less than a cell above the lowest point of the domain does none of that, if no force acts on it.
-    Colliders and walls that move count by their speed alone (`scene_bounds`), whatever they push.
+    A solid at rest less than a cell above the lowest point of the domain is left out if no force acts on it.
+    Moving colliders and walls contribute their speed only (`scene_bounds`).
     """
     gravity, periodic = scene.domain.gravity_at(0.0), np.array(scene.domain.periodic)
     steady = scene.domain.steady and not gravity[periodic].any()
@@ -223,12 +224,12 @@ def scene_bounds(scene: Scene, sources: Sequence[Body | Emitter] | None = None) 
     highest matter above the lowest point of the domain, both measured against gravity; v0 alone where
     there is no gravity. height = H, or the largest extent of the matter where there is no gravity.
 
-    The speed is that of the fastest wall, and of the fastest point of a collider, at least. Along a periodic axis there
-    is no lowest point: gravity along it adds its impulse over the run, and no height.
+    The speed is at least that of the fastest wall and of the fastest point of a collider. Along a periodic axis there
+    is no lowest point: gravity along it adds its impulse over the run and no height.
 
-    For gravity that depends on time, the strongest counts, and the largest H of any instant; its impulse bounds the
-    speed too. Forces of magnitude a add min(2 a L, I^2) to the square of the speed, L the largest extent of the domain
-    and I their impulse over the run, and a to the gravity that presses. See `force_drive` for where they are looked at.
+    For time-dependent gravity, g is the largest magnitude and H the largest of any instant; the impulse also bounds the
+    speed. Forces of magnitude a add min(2 a L, I^2) to the square of the speed, L the largest extent of the domain and
+    I their impulse over the run, and add a to g in the pressure. `force_drive` states where they are evaluated.
     Impulses add their strength to the speed.
     """
     sources = scene.sources if sources is None else sources
@@ -253,7 +254,7 @@ def scene_bounds(scene: Scene, sources: Sequence[Body | Emitter] | None = None) 
         height = max(0.0, *(float(np.max(_falls(scene, corners, gravity))) for gravity in pulling))
     else:
         height = float(np.max(np.ptp(corners, axis=0)))
-    # What presses on no face pulls as long as the run.
+    # Along a periodic axis gravity accelerates the material for the whole run.
     weight = g if closed.all() else max(float(np.linalg.norm(gravity * closed)) for gravity in gravities)
     fallen = 2 * weight * height if scene.domain.steady else min(2 * weight * height, pull.impulse * pull.impulse)
     if not closed.all():
@@ -270,10 +271,10 @@ def scene_bounds(scene: Scene, sources: Sequence[Body | Emitter] | None = None) 
 
 
 def highest_speed(body: Body | Emitter) -> float:
-    """Return a bound on the initial speed of a body, m/s: that at the corners of its bounding box.
+    """Return a bound on the initial speed of a body, m/s: the largest at the corners of its bounding box.
 
-    For a velocity that is an expression, it is the largest over a lattice of points of the body. The largest of the
-    velocities that stand beside points in a file is added.
+    For a velocity that is an expression, it is the largest over a lattice of points of the body. The largest velocity
+    given with the points of a file is added.
     """
     if isinstance(body, Emitter):
         return float(np.linalg.norm(body.velocity))
@@ -303,7 +304,7 @@ def body_points(body: Body) -> np.ndarray:
 
 
 def body_places(body: Body, index: int, h: float) -> np.ndarray:
-    """Return where the particles of a body start, (n, d), m; points of a lattice in it where there are too many."""
+    """Return the initial positions of the particles of a body, (n, d), m; lattice points if there are too many."""
     if estimate_body(body, h) > MOST_LOOKED_AT:
         return body_points(body)
     found = particle_places(body, index, h)
@@ -311,10 +312,10 @@ def body_places(body: Body, index: int, h: float) -> np.ndarray:
 
 
 def _falls(scene: Scene, corners: np.ndarray, gravity: np.ndarray) -> np.ndarray:
-    """Return how far each point lies above the lowest point of the domain, m, against gravity."""
+    """Return the height of each point above the lowest point of the domain, m, against gravity."""
     largest = float(np.max(np.abs(gravity)))
     if not SQUARED[0] < largest < SQUARED[1]:
-        # Only its direction counts, and its squares would leave the range of numbers.
+        # Only its direction is used; its square could overflow.
         gravity = gravity / largest
     down = gravity / float(np.linalg.norm(gravity))
     floor = np.max(_corners(np.array(scene.domain.origin), np.array(scene.domain.upper)) @ down)

@@ -1,6 +1,4 @@
-"""Checks that need the whole scene: bodies inside the domain, apart, not empty and well started; forces on bodies that
-exist; fields that are stored.
-"""
+"""Checks that need the whole scene: geometry and initial state of bodies, names, output fields."""
 
 import math
 from collections.abc import Iterator
@@ -32,14 +30,14 @@ from mpmcli.scene.sheets import most_in_mouth, most_until_end, mouth_of, sheets_
 
 # Lengths below this fraction of the grid spacing are round-off.
 _TOLERANCE = 1e-6
-# Particles that a run can number.
+# Largest number of particles of a run.
 _MOST = 2**31 - 1
-# Particles of one sheet.
+# Largest number of particles of one sheet.
 _MOST_IN_MOUTH = 10_000_000
 
 
 def emitter_problems(scene: Scene) -> Iterator[Problem]:
-    """Find emitters that cannot be, and solvers that know neither emitters nor open faces."""
+    """Find invalid emitters, and solvers that support neither emitters nor open faces."""
     for k, emitter in enumerate(scene.emitters):
         where = ("emitters", k)
         count = most_in_mouth(emitter, scene.domain.spacing)
@@ -58,7 +56,7 @@ def emitter_problems(scene: Scene) -> Iterator[Problem]:
         places, origin, upper = mouth.places, np.array(scene.domain.origin), np.array(scene.domain.upper)
         beyond = np.maximum(origin - places, places - upper).max(axis=0)
         for axis in np.flatnonzero(beyond > _TOLERANCE * scene.domain.spacing):
-            said = f'the mouth of "{emitter.name}" reaches out of the domain along {AXES[axis]} by {beyond[axis]:.6g} m'
+            said = f'the mouth of "{emitter.name}" extends beyond the domain along {AXES[axis]} by {beyond[axis]:.6g} m'
             yield Problem((*where, "shape"), said + "; move it or enlarge the domain")
         yield from (Problem((*where, "shape"), said) for said in _in_the_way(emitter, places, scene))
         if emitter.start >= scene.time.end:
@@ -73,12 +71,12 @@ def emitter_problems(scene: Scene) -> Iterator[Problem]:
     found = [("emitters",)] * bool(scene.emitters) + [("domain", "walls")] * opens
     if scene.solver.solids == "total" and found:
         what = "emitters" if scene.emitters else "open faces"
-        said = f'solver.solids = "total" knows no {what}: give solids = "updated", or leave them out'
+        said = f'solver.solids = "total" supports no {what}: give solids = "updated", or leave them out'
         yield Problem(found[0], said)
 
 
 def _in_the_way(emitter: Emitter, places: np.ndarray, scene: Scene) -> Iterator[str]:
-    """Find what a mouth lies in: bodies, if it lets in from the start, and colliders that never move."""
+    """Find bodies (if inflow begins at the start) and colliders at rest that overlap a mouth."""
     h = scene.domain.spacing
     found = [
         (f'body "{body.name}"', body.shape.form.contains(places, inset=_TOLERANCE * h))
@@ -114,11 +112,11 @@ def _emitted(emitter: Emitter, scene: Scene) -> Iterator[tuple[str, str]]:
         yield "particles", f"would be {sheets.particles:.3g}, more than a run can number, {_MOST}; give fewer"
 
 
-# Cells that a particle may lie inside of a collider: of round-off, and of curved surfaces that are given by chords.
+# Depth in cells at which a particle may lie inside a collider: round-off, and chords of curved surfaces.
 _SLACK = 0.1
-# Lattices above this size are not looked at.
+# Lattices above this size are not examined.
 _MOST_PLACES = 1_000_000
-# Cells within the bounding box of a collider whose distances are kept on a grid, of as many nodes.
+# Largest number of cells in the bounding box of a collider whose distances are stored on a grid.
 _MOST_CELLS = 100_000_000
 
 
@@ -135,9 +133,9 @@ def gravity_problems(scene: Scene) -> Iterator[Problem]:
 
 
 def collider_problems(scene: Scene) -> Iterator[Problem]:
-    """Find colliders that share a name, that bodies overlap, that nothing can meet, and that jump."""
+    """Find colliders that share a name, overlap bodies, lie outside the domain, or jump."""
     if scene.colliders and scene.solver.solids == "total":
-        said = '"total" knows walls only, and the scene has colliders: give solids = "updated"'
+        said = '"total" supports walls only, and the scene has colliders: give solids = "updated"'
         yield Problem(("solver", "solids"), said)
     first: dict[str, int] = {}
     placed = True
@@ -151,7 +149,7 @@ def collider_problems(scene: Scene) -> Iterator[Problem]:
         if unfit:
             continue
         yield from _out_of_reach(collider, k, scene)
-        # Its distances are computed at nodes.
+        # Its distances are stored at nodes.
         if isinstance(collider.form, Mesh | Composite | Polygon):
             spans = np.ptp(np.array(collider.form.bounds()), axis=0) / scene.domain.spacing
             if not (count := float(np.prod(spans + 1))) <= _MOST_CELLS:
@@ -160,7 +158,7 @@ def collider_problems(scene: Scene) -> Iterator[Problem]:
                 )
                 said += "and shapes of several; leave out what is out of reach"
                 yield Problem(("colliders", k, "shape"), said)
-    # Bodies of which a particle starts in a collider.
+    # Bodies with a particle that starts inside a collider.
     h = scene.domain.spacing
     for i, body in enumerate(scene.bodies if placed and scene.colliders else ()):
         if lattice_points(body, h) > _MOST_PLACES:
@@ -178,7 +176,7 @@ def collider_problems(scene: Scene) -> Iterator[Problem]:
 
 
 def _unfit(collider: Collider, index: int, end: float) -> Iterator[Problem]:
-    """Find motions that are not finite, and places that jump."""
+    """Find motions that are not finite, and positions that jump."""
     for key in ("velocity", "angular_velocity", "offset", "angle"):
         for path, entry in entries_in(getattr(collider, key), ("colliders", index, key)):
             if isinstance(entry, Expression):
@@ -210,18 +208,18 @@ def _out_of_reach(collider: Collider, index: int, scene: Scene) -> Iterator[Prob
 _CLEAR = 2
 # Cells between bodies beyond which they share no node.
 _APART = 3
-# Points per axis that are tried where two bodies may overlap, 2D and 3D.
+# Points per axis that are tested in the common box of two bodies, 2D and 3D.
 _MOST_TRIED = {2: 512, 3: 64}
-# Cells within the bounding box of a body that is relaxed: some 1.6 GB of nodes.
+# Largest number of cells in the bounding box of a relaxed body: some 1.6 GB of nodes.
 _MOST_RELAXED = 10_000_000
-# Lattices above this size are not searched for a first particle; sampling does it later.
+# Lattices above this size are not searched for a first particle here; sampling does so later.
 _MOST_SEARCHED = 1_000_000
 
 
 def problems_in(scene: Scene) -> list[Problem]:
-    """Return everything that is wrong with a scene whose tables are valid, one by one."""
+    """Return the problems of a scene whose tables are valid one by one."""
     outside = list(_outside(scene))
-    # A body that is much too large is reported, and not filled.
+    # A body that is much too large is reported but not filled.
     empty = [] if outside else list(_empty(scene))
     unstarted = [] if outside or empty else list(_initial(scene))
     colliding = [] if outside or empty else list(collider_problems(scene))
@@ -269,7 +267,7 @@ def _overlaps(scene: Scene) -> Iterator[Problem]:
     bounds = [body.shape.form.bounds() for body in scene.bodies]
     lowers, uppers = np.array([b[0] for b in bounds]), np.array([b[1] for b in bounds])
     for j in range(1, len(bounds)):
-        # Only bodies whose bounding boxes meet are looked at closely.
+        # Only bodies whose bounding boxes meet are compared in detail.
         lower, upper = np.maximum(lowers[:j], lowers[j]), np.minimum(uppers[:j], uppers[j])
         for i in np.flatnonzero(np.all(upper - lower > _TOLERANCE * h, axis=1)):
             first, second = scene.bodies[i], scene.bodies[j]
@@ -289,7 +287,7 @@ def _common_point(first: Body, second: Body, lower: np.ndarray, upper: np.ndarra
     counts = [int(np.clip(math.ceil(min(r, most)), 8, most)) for r in (upper - lower) / finest]
     axes = [lo + (np.arange(n) + 0.5) * (hi - lo) / n for lo, hi, n in zip(lower, upper, counts, strict=True)]
     points = grid_points(*axes)
-    # Distances from a surface cost more than the side, and points of both are few.
+    # A distance costs more than an inside test, and few points lie in both bodies.
     for inset in (0.0, _TOLERANCE * h):
         for form in forms:
             points = points[form.contains(points, inset=inset)]
@@ -299,7 +297,7 @@ def _common_point(first: Body, second: Body, lower: np.ndarray, upper: np.ndarra
 def _empty(scene: Scene) -> Iterator[Problem]:
     h = scene.domain.spacing
     for i, body in enumerate(scene.bodies):
-        # The lattice of a box is fitted to it, and has a point at least.
+        # The lattice of a box is fitted to it and has at least one point.
         fitted = isinstance(body.shape.form, Box) and body.sampling != "poisson"
         if not fitted and lattice_points(body, h) <= _MOST_SEARCHED and not holds_particles(body, i, h):
             yield Problem(("bodies", i, "shape"), no_particles(body, h))
@@ -316,7 +314,7 @@ def _too_large_to_relax(scene: Scene) -> Iterator[Problem]:
 
 
 def _initial(scene: Scene) -> Iterator[Problem]:
-    """Find deformations that do not fit their law, and what is not finite where a particle starts."""
+    """Find deformations that do not fit their law, and initial values that are not finite at a particle."""
     h = scene.domain.spacing
     for i, body in enumerate(scene.bodies):
         misfits = list(_misfits(body, scene))
@@ -328,7 +326,7 @@ def _initial(scene: Scene) -> Iterator[Problem]:
 
 
 def _misfits(body: Body, scene: Scene) -> Iterator[tuple[str, str]]:
-    """Find a deformation that the law does not store, and a pressure that the depth does not set."""
+    """Find a deformation that the law does not store, and a pressure that does not follow from the depth."""
     law, keeps_J, d = body.material.law, body.material.stores == "J", scene.dimension
     if body.deformation is not None and isinstance(body.deformation, tuple) == keeps_J:
         rest = [[int(i == j) for j in range(d)] for i in range(d)]
@@ -360,7 +358,7 @@ def _pushed(scene: Scene) -> Iterator[Problem]:
         solid = any(one.free and one.name == force.body for one in scene.colliders)
         if force.force is not None and force.body in names and not found and not solid:
             yield Problem(
-                ("forces", k, "force"), f'"{force.body}" flows in, and has no mass at the start; give acceleration'
+                ("forces", k, "force"), f'"{force.body}" is an emitter, and has no mass at the start; give acceleration'
             )
         if force.region is not None and solid:
             yield Problem(
@@ -394,7 +392,7 @@ def _paired(scene: Scene) -> Iterator[Problem]:
 
 
 def _total(scene: Scene) -> Iterator[Problem]:
-    """Find what the grid of the state at rest cannot hold."""
+    """Find the parts of a scene that solver.solids = "total" does not support."""
     if scene.solver.solids != "total":
         return
     where = ("solver", "solids")
@@ -402,7 +400,7 @@ def _total(scene: Scene) -> Iterator[Problem]:
     if len(names) > 1:
         said = f'"total" is for bodies of one law; found {listed(names, "and")}: give solids = "updated"'
         yield Problem(where, said)
-    # Bodies that share nodes at rest, which would hold them together.
+    # Bodies that share nodes at rest would stay joined.
     h = scene.domain.spacing
     bounds = [body.shape.form.bounds() for body in scene.bodies]
     for j, (lower, upper) in enumerate(bounds):
@@ -430,7 +428,7 @@ def _total(scene: Scene) -> Iterator[Problem]:
 
 
 def _nearly_held(body: Body, index: int, scene: Scene) -> Iterator[Problem]:
-    """Find walls that stick and are met later, and those that do not let go, which only the kernels of a body reach."""
+    """Find "stick" walls that a body can meet only later, and walls not "separate" that only its kernels reach."""
     h, domain = scene.domain.spacing, scene.domain
     lower, upper = body.shape.form.bounds()
     for k, pair in enumerate(domain.walls.faces(scene.dimension)):
@@ -438,8 +436,8 @@ def _nearly_held(body: Body, index: int, scene: Scene) -> Iterator[Problem]:
         for side, word, gap in zip(("min", "max"), pair, gaps, strict=True):
             if word != "separate" and _TOLERANCE * h < gap < _CLEAR * h:
                 said = (
-                    f'body "{body.name}" begins {gap:.4g} m from the wall {AXES[k]}_{side}, which never lets go; with '
-                    f'solver.solids = "total" it must touch it, or begin {_CLEAR * h:.4g} m away, or the wall be '
+                    f'body "{body.name}" begins {gap:.4g} m from the wall {AXES[k]}_{side}, which does not separate; '
+                    f'with solver.solids = "total" it must touch it, or begin {_CLEAR * h:.4g} m away, or the wall be '
                     '"separate"'
                 )
                 yield Problem(("bodies", index, "shape"), said)
@@ -453,7 +451,7 @@ def _nearly_held(body: Body, index: int, scene: Scene) -> Iterator[Problem]:
 
 
 def _unstored(scene: Scene) -> Iterator[Problem]:
-    """Find output fields that are internal variables of laws which no body follows."""
+    """Find output fields that are internal variables of laws that no body follows."""
     stored = {variable.name for body in scene.sources for variable in body.material.internal_in(scene.dimension)}
     available = [*get_args(ParticleField), *sorted(stored)]
     for k, name in enumerate(scene.output.fields):

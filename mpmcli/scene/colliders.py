@@ -1,4 +1,4 @@
-"""Colliders: rigid things that the material meets, at rest or moving as the scene says."""
+"""Colliders: rigid obstacles, at rest, with prescribed motion, or moving freely."""
 
 import math
 from collections.abc import Sequence
@@ -21,13 +21,13 @@ from mpmcli.scene.rigid import Fixed, Hinge, Joint, Moments, Path, Posed, SpinAx
 from mpmcli.scene.shapes import Form, Shape, exactly_one_form
 
 TIME = Name("t")
-# In which jumps are looked for one by one, so that a pair of them does not cancel.
+# Number of parts that are searched for jumps separately, so that two jumps do not cancel.
 PIECES = 8
 
 
 @dataclass(frozen=True)
 class Motion(Posed):
-    """The motion of a rigid thing about a pivot that moves with it.
+    """The motion of a rigid body about a pivot that moves with it.
 
     A point that starts at X is at pivot + offset + R(angle) (X - pivot), R the rotation about a fixed axis.
     """
@@ -73,7 +73,7 @@ class Motion(Posed):
 
 
 def between_keys(times: Sequence[float], values: Sequence[float]) -> Tree:
-    """Return the slope of what goes linearly through values at times that rise, and stays before and after; a tree."""
+    """Return the slope of the linear interpolation of values at rising times, constant before and after; a tree."""
     result: Tree = Constant(0.0)
     for (t0, v0), (t1, v1) in reversed(list(pairwise(zip(times, values, strict=True)))):
         result = apply("if", apply("<", TIME, Constant(t1)), Constant((v1 - v0) / (t1 - t0)), result)
@@ -83,7 +83,7 @@ def between_keys(times: Sequence[float], values: Sequence[float]) -> Tree:
 
 
 def has_jump(tree: Tree, slope: Tree, end: float) -> bool:
-    """Say whether a tree of t jumps between 0 and `end` (s): whether the integral of its slope misses it."""
+    """Return whether a tree of t jumps between 0 and `end` (s): whether it differs from the integral of its slope."""
     times = np.linspace(0.0, end, PIECES + 1)
     values = [float(evaluate(tree, {"t": time})) for time in times]
     scale = max(largest_of(tree, 0.0, end), 1e-12)
@@ -94,13 +94,13 @@ def has_jump(tree: Tree, slope: Tree, end: float) -> bool:
 
 
 Normal = direction_as("[0, 1] has in 2D")
-# What a surface does, as walls of the domain.
+# Boundary condition of a surface, as for walls of the domain.
 SurfaceWord = Literal["slip", "stick", "separate", "hold"]
 ZERO = Constant(0.0)
 
 
 class Plane(Table):
-    """A half space: all that lies behind a plane."""
+    """A half space: all points behind a plane."""
 
     point: Vector = Field(description="A point of the plane, m.")
     normal: Normal = Field(description="Direction out of the collider, into the material, of any length.")
@@ -118,7 +118,7 @@ class Plane(Table):
 class ColliderShape(Shape):
     """The shape of a collider: one of the forms of bodies, or a plane."""
 
-    plane: Plane | None = Field(None, description="A half space: all that lies behind a plane.")
+    plane: Plane | None = Field(None, description="A half space: all points behind a plane.")
 
 
 OneColliderShape = Annotated[
@@ -127,25 +127,26 @@ OneColliderShape = Annotated[
 
 
 class Keyframe(Table):
-    """Where a collider is at a time."""
+    """Position and angle of a collider at a time."""
 
     time: NotNegative = Field(description="s.")
     offset: Vector = Field(
-        None, validate_default=True, description="Offset from where its shape stands, m. Default: zeros."
+        None, validate_default=True, description="Offset from the place of its shape, m. Default: zeros."
     )
     angle: Number = Field(0.0, description="Angle that it is turned by, rad.")
 
 
 class Collider(Table):
-    """A rigid thing that the material meets."""
+    """A rigid obstacle."""
 
     name: str = Field(pattern=NAME, description="Name of the collider, for messages and --set.")
-    shape: OneColliderShape = Field(description="What it is made of: a form as bodies have, or a plane.")
+    shape: OneColliderShape = Field(description="Shape: a form, as of bodies, or a plane.")
     side: Literal["outside", "inside"] = Field(
-        "outside", description="Where the material is: outside of the shape, or inside, as in a container."
+        "outside", description="Side of the material: outside the shape, or inside, as in a container."
     )
     wall: SurfaceWord = Field(
-        "separate", description="What its surface does: slip, stick or separate; hold: what lies inside moves with it."
+        "separate",
+        description="Condition at its surface: slip, stick or separate; hold: material inside moves with it.",
     )
     friction: NotNegative = Field(0.0, description="Coefficient of friction, unless it sticks.")
     axes: tuple[Literal["x", "y", "z"], ...] | None = Field(
@@ -156,7 +157,7 @@ class Collider(Table):
         validate_default=True,
         description="Velocity, m/s; numbers, or expressions of the time t (s). Default: at rest.",
     )
-    angular_velocity: OfTime = Field(0.0, description="Rate at which it turns about its axis, rad/s.")
+    angular_velocity: OfTime = Field(0.0, description="Rate of rotation about its axis, rad/s.")
     offset: list_of_axes(OfTime) | None = Field(
         None, description="Offset from where its shape stands, m, in place of the velocity. Default: none."
     )
@@ -172,8 +173,8 @@ class Collider(Table):
     )
     density: Positive | None = Field(
         None,
-        description="Density, kg/m^3, of one that moves freely: velocity and angular_velocity are those at the start. "
-        "Default: it moves as the scene says.",
+        description="Density, kg/m^3, of a free collider, whose velocity and angular_velocity are initial values. "
+        "Default: prescribed motion.",
     )
     mass: Positive | None = Field(
         None, description="Mass, kg (2D: per metre of depth), in place of the density. Default: that of the density."
@@ -186,9 +187,9 @@ class Collider(Table):
         description="Coefficient of restitution, 0 to 1, where rigid bodies meet; of two the larger one counts.",
     )
     fixed: tuple[Fixed, ...] = Field(
-        (), description='What a free one does not do: move along "x", "y" or "z", or "rotation". Default: nothing.'
+        (), description='Motions that a free collider cannot make: along "x", "y" or "z", or "rotation". Default: none.'
     )
-    joint: Joint | None = Field(None, description="What holds a free one to the world: a hinge or a slider.")
+    joint: Joint | None = Field(None, description="Joint between a free collider and the world: a hinge or a slider.")
     _path: Path | None = PrivateAttr(None)
 
     @model_validator(mode="after")
@@ -219,7 +220,7 @@ class Collider(Table):
         return self
 
     def _require_free(self) -> None:
-        """Refuse what a rigid body that moves freely cannot have."""
+        """Refuse keys that a free rigid body cannot have."""
         given = "mass" if self.density is None else "density"
         if None not in (self.density, self.mass):
             raise flaw('"density" is given as well; leave one of them out', "mass")
@@ -231,7 +232,7 @@ class Collider(Table):
         if varies(*self.velocity, self.angular_velocity):
             key = "velocity" if varies(*self.velocity) else "angular_velocity"
             raise flaw(f"must be a number, that at the start, where {given} lets it move freely", key)
-        # A start that a joint or what is fixed does not allow.
+        # An initial motion that the joint or the fixed axes do not allow.
         d, hinged = len(self.velocity), isinstance(self.joint, Hinge)
         if self.fixed and (self.joint or not ways_of(d, self.fixed).size):
             both = '"joint" is given as well; leave one of them out'
@@ -249,7 +250,7 @@ class Collider(Table):
                 raise flaw("must be 0 along what joint or fixed holds", key)
 
     def _gives(self, key: str) -> bool:
-        """Return whether a motion is given; zeros, as defaults are written out, are none."""
+        """Return whether a motion is given and is not zero; defaults are written out as zeros."""
         value = getattr(self, key)
         return bool(any(value) if isinstance(value, tuple) else value)
 
@@ -264,22 +265,22 @@ class Collider(Table):
 
     @property
     def holds(self) -> bool:
-        """Whether what lies inside moves with it, as a part that is pinned; it is no obstacle then."""
+        """Whether the material inside moves with it, as a pinned part; it is then no obstacle."""
         return self.wall == "hold"
 
     @property
     def driven(self) -> bool:
-        """Whether it moves as the scene says."""
+        """Whether the scene prescribes its motion."""
         return not self.free and self.motion.moves
 
     @cached_property
     def moments(self) -> Moments:
-        """Mass, centre and inertia of one that moves freely."""
+        """Mass, centre and inertia of a free collider."""
         return moments_of(self.form, self.density, self.mass)
 
     @property
     def center(self) -> tuple[float, ...]:
-        """The pivot: as it is given, or the centre of mass, or of the bounding box, or the point of a plane."""
+        """The pivot: as given, else the centre of mass, the centre of the bounding box, or the point of a plane."""
         if self.free:
             return self.moments.center
         if self.pivot is not None:
@@ -290,44 +291,44 @@ class Collider(Table):
 
     @property
     def radius(self) -> float:
-        """The distance from the pivot that no point of it exceeds, m; infinite for a plane."""
+        """Largest distance of any of its points from the pivot, m; infinite for a plane."""
         if isinstance(self.form, Plane):
             return math.inf
         return float(np.linalg.norm(np.abs(np.array(self.form.bounds()) - self.center).max(axis=0)))
 
     @property
     def spin(self) -> np.ndarray:
-        """Angular velocity at the start of one that moves freely, (1,) or (3,), rad/s."""
+        """Initial angular velocity of a free collider, (1,) or (3,), rad/s."""
         axis = unit((self.joint.axis if isinstance(self.joint, Hinge) else self.axis) or Z)
         return self.angular_velocity * (axis[2:] if len(self.velocity) == 2 else axis)
 
     @property
     def arm(self) -> np.ndarray:
-        """From the point of the hinge of one that moves freely to its centre at the start, (d,), m."""
+        """Initial vector from the hinge point of a free collider to its centre, (d,), m."""
         point = getattr(self.joint, "point", None)
         return np.zeros(len(self.velocity)) if point is None else np.array(self.center) - point
 
     @property
     def ways(self) -> np.ndarray:
-        """Velocities and spins that one that moves freely may start with, (k, n), of each of n ways at a rate of 1."""
+        """Initial velocity and spin of a free collider at unit rate of each of its n degrees of freedom, (k, n)."""
         return self.joint.way(self.arm)[:, None] if self.joint else ways_of(len(self.velocity), self.fixed)
 
     @property
     def rates(self) -> np.ndarray:
-        """Velocity and spin at the start of one that moves freely, (k,), m/s and rad/s."""
+        """Initial velocity and spin of a free collider, (k,), m/s and rad/s."""
         if isinstance(self.joint, Hinge):
             return self.angular_velocity * self.ways[:, 0]
         return np.concatenate([self.velocity, self.spin])
 
     def along(self, times: np.ndarray, poses: np.ndarray) -> "Collider":
-        """Return it with the motion that a run found: poses (n, k), places with angles or quaternions, at times, s."""
+        """Return it with a computed motion: poses (n, k), positions with angles or quaternions, at times, s."""
         d, found = len(self.velocity), self.model_copy()
         found._path = Path(self.center, times, poses[:, :d], turned_by(poses[:, d:]))
         return found
 
     @property
     def motion(self) -> Motion | Path:
-        """How it moves; of one that moves freely that at the start, or see `along`."""
+        """Its motion; for a free collider the initial one, or that set by `along`."""
         if self.free:
             return self._path or Path.start(self.center)
         d = len(self.velocity)
@@ -350,7 +351,7 @@ class Collider(Table):
     def fastest(self, domain: Domain, end: float) -> float:
         """Return a bound on the speed of its points in a domain between time 0 and `end` (s), m/s.
 
-        Of one that moves freely it is that at the start, and at the largest rate of its motor.
+        For a free collider it covers the initial speed and the largest rate of its motor.
         """
         if self.free:
             motions = [self.rates]
@@ -359,7 +360,7 @@ class Collider(Table):
             d = len(self.velocity)
             return max(float(np.linalg.norm(u[:d]) + np.linalg.norm(u[d:]) * self.radius) for u in motions)
         motion = self.motion
-        # What lies outside of the domain meets nothing; the pivot goes this far at most.
+        # Points outside the domain meet no material; the pivot moves at most this far.
         gone = float(np.linalg.norm(motion.offset)) + end * motion.fastest(0.0, end)
         far = np.linalg.norm(np.abs(np.array([domain.origin, domain.upper]) - self.center).max(axis=0)) + gone
         return motion.fastest(min(self.radius, float(far)), end)

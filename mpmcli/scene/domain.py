@@ -1,4 +1,4 @@
-"""The domain of a scene: a box of whole grid cells, gravity, and what its walls do."""
+"""The domain of a scene: a box of whole grid cells, gravity, and wall conditions."""
 
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any, Literal, get_args
@@ -26,7 +26,7 @@ MOST_CELLS = 2**31 - 1
 
 
 def cells_of(size: tuple[float, ...], spacing: float) -> tuple[int, ...]:
-    """Return the cells per axis; refuse a size (m) that is no whole number of them."""
+    """Return the cells per axis; refuse a size (m) that is not a whole number of cells."""
     ratios = [s / spacing for s in size]
     if max(ratios) > MOST_CELLS:
         raise flaw(f"makes more than {MOST_CELLS} cells along an axis; make it coarser", "spacing")
@@ -59,8 +59,8 @@ def spacing_of(size: tuple[float, ...], cells: tuple[int, ...]) -> float:
 
 
 PERIODIC = "periodic"
-# Particles are put back into the domain when they are sorted. Until then they reach up to three nodes beyond a face,
-# and no node may have two images.
+# Sorting moves particles back into the domain. Before it they reach up to three nodes beyond a face, and no node may
+# have two images.
 FEWEST_PERIODIC_CELLS = 7
 
 Velocity = list_of_axes(Number)
@@ -78,18 +78,18 @@ class Faces(Table):
 
 
 class WallVelocity(Faces):
-    """Velocity of each face that moves along itself: one that sticks, or that has friction."""
+    """Tangential velocity of each face that sticks or has friction."""
 
-    x_min: Velocity | None = Field(None, description="Of the lower face along x, m/s.")
-    x_max: Velocity | None = Field(None, description="Of the upper face along x, m/s.")
-    y_min: Velocity | None = Field(None, description="Of the lower face along y, m/s.")
-    y_max: Velocity | None = Field(None, description="Of the upper face along y, m/s.")
-    z_min: Velocity | None = Field(None, description="Of the lower face along z, m/s; 3D only.")
-    z_max: Velocity | None = Field(None, description="Of the upper face along z, m/s; 3D only.")
+    x_min: Velocity | None = Field(None, description="Velocity of the lower face along x, m/s.")
+    x_max: Velocity | None = Field(None, description="Velocity of the upper face along x, m/s.")
+    y_min: Velocity | None = Field(None, description="Velocity of the lower face along y, m/s.")
+    y_max: Velocity | None = Field(None, description="Velocity of the upper face along y, m/s.")
+    z_min: Velocity | None = Field(None, description="Velocity of the lower face along z, m/s; 3D only.")
+    z_max: Velocity | None = Field(None, description="Velocity of the upper face along z, m/s; 3D only.")
 
 
 def require_grip(velocity: WallVelocity, words: Mapping[str, str], frictions: Mapping[str, float]) -> None:
-    """Refuse the velocity of a wall through itself, and that of one which nothing holds to the material."""
+    """Refuse a wall velocity normal to the wall, and one of a wall that neither sticks nor has friction."""
     for face in words:
         found = getattr(velocity, face)
         if found is None:
@@ -114,16 +114,16 @@ Wall = Literal["slip", "stick", "separate", "periodic", "open"]
 WALLS: tuple[str, ...] = get_args(Wall)
 # Each wall acts on nodes up to two cells away from it, and no node may belong to both walls of an axis.
 FEWEST_CELLS = 5
-# Faces without friction: nothing slips along them, or they are no wall.
+# Faces without friction: material does not slip along them, or they are no walls.
 _NEVER_SLIP = ("stick", PERIODIC, "open")
 
 
 class Walls(Faces):
-    """What each face of the domain does to the material that meets it.
+    """The boundary condition at each face of the domain.
 
     slip: no motion through the wall, free motion along it. stick: no motion at all.
-    separate: as slip, but the material may leave the wall. periodic: what leaves here enters at the opposite face.
-    open: no wall; what passes the face is gone.
+    separate: as slip, but the material may leave the wall. periodic: material that leaves here enters at the opposite
+        face. open: no wall; particles that pass the face are removed.
     """
 
     default: Wall = Field("separate", description="For every face that is not named.")
@@ -135,7 +135,7 @@ class Walls(Faces):
     z_max: Wall | None = Field(None, description="Upper face along z; 3D only.")
 
     def faces(self, dimension: int) -> tuple[tuple[Wall, Wall], ...]:
-        """Return what the lower and the upper face along each axis do."""
+        """Return the conditions of the lower and the upper face along each axis."""
         return tuple(
             (getattr(self, f"{axis}_min") or self.default, getattr(self, f"{axis}_max") or self.default)
             for axis in AXES[:dimension]
@@ -149,7 +149,7 @@ class Walls(Faces):
 class Friction(Faces):
     """Coefficient of Coulomb friction of each face that slips or separates.
 
-    The wall takes at most the coefficient times the normal force from the force along it that would make it stick.
+    The tangential force is the one that makes the material stick, but at most the coefficient times the normal force.
     """
 
     default: NotNegative = Field(0.0, description="For every face that is not named and does not stick.")
@@ -179,7 +179,7 @@ def _one_word_for_all(value: object) -> object:
 
 
 def _or_table(single: dict[str, Any], default: object) -> Callable[[dict[str, Any]], None]:
-    """Return what lets a JSON Schema of a table take a single value for all faces too."""
+    """Return a JSON Schema hook by which a table also accepts a single value for all faces."""
 
     def change(schema: dict[str, Any]) -> None:
         table = {key: schema.pop(key) for key in ("$ref", "allOf") if key in schema}
@@ -222,7 +222,7 @@ class Domain(Table):
         json_schema_extra=_or_table({"type": "number", "minimum": 0}, 0),
     )
     wall_velocity: WallVelocity | None = Field(
-        None, description="Velocity along themselves of walls that stick or have friction, m/s."
+        None, description="Tangential velocity of walls that stick or have friction, m/s."
     )
 
     @field_validator("size")
@@ -234,7 +234,7 @@ class Domain(Table):
 
     @model_validator(mode="after")
     def _both_spacing_and_cells(self) -> "Domain":
-        """Give the domain its cells from its spacing, or its spacing from its cells."""
+        """Compute the cells from the spacing, or the spacing from the cells."""
         if self.spacing is None and self.cells is None:
             raise flaw('missing key "spacing" (m), or "cells" (a number per axis) in its place')
         if self.spacing is not None and self.cells is not None:

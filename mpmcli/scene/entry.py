@@ -29,10 +29,10 @@ Entry = float | Expression
 
 
 def entry_of(*names: str) -> Any:
-    """Return the type of a value that is a number, or an expression of some names."""
+    """Return the type of a value that is a number or an expression of the given names."""
 
     def read(value: object, info: ValidationInfo) -> Entry:
-        """Return the number, or the expression of a text; a text that depends on nothing is its number."""
+        """Return a number or the expression of a text; a constant expression gives its number."""
         if isinstance(value, str):
             missing = () if scene_dimension(info) != 2 else (POSITION[2], INITIAL[2])
             try:
@@ -57,7 +57,7 @@ def entry_of(*names: str) -> Any:
 
 
 def plain(value: object) -> object:
-    """Return an entry, or lists of entries, as TOML holds them."""
+    """Return an entry, or lists of entries, as TOML values."""
     if isinstance(value, list | tuple):
         return [plain(entry) for entry in value]
     return value.source if isinstance(value, Expression) else value
@@ -74,7 +74,7 @@ def tree_of(entry: Entry) -> Tree:
 
 
 def entries_in(value: Any, path: Path = ()) -> Iterator[tuple[Path, Entry]]:
-    """Yield the entry that a value is, or those of a vector or matrix, each with its path; nothing for None."""
+    """Yield a scalar entry, or those of a vector or matrix, each with its path; nothing for None."""
     if isinstance(value, tuple):
         for k, inner in enumerate(value):
             yield from entries_in(inner, (*path, k))
@@ -83,7 +83,7 @@ def entries_in(value: Any, path: Path = ()) -> Iterator[tuple[Path, Entry]]:
 
 
 def varies(*entries: Entry) -> bool:
-    """Say whether any of the entries is an expression."""
+    """Return whether any of the entries is an expression."""
     return any(isinstance(entry, Expression) for entry in entries)
 
 
@@ -131,17 +131,17 @@ ConstantTable = Annotated[
 
 
 def definitions(table: object, dimension: int | None) -> tuple[dict[str, ast.expr], dict[str, str]]:
-    """Return what each constant of the table [constants] stands for, and what is wrong with others, by name."""
+    """Return the expression of each constant of the table [constants], and the fault of each invalid one, by name."""
     found: dict[str, ast.expr] = {}
     faults: dict[str, str] = {}
     quantities = [name for name in QUANTITIES if dimension != 2 or name not in (POSITION[2], INITIAL[2])]
     for name, value in table.items() if isinstance(table, Mapping) else ():
         if not _NAME.fullmatch(name):
-            faults[name] = "is no name for an expression; use letters, digits and _, and begin with a letter"
+            faults[name] = "is not a valid name in an expression; use letters, digits and _, and begin with a letter"
         elif name in QUANTITIES or name in CONSTANTS or name in FUNCTIONS or iskeyword(name):
             faults[name] = "has a meaning in every expression already; take another name"
         else:
-            # What uses a constant that is wrong has no fault of its own.
+            # An expression that uses a faulty constant has no fault of its own.
             read: Expression | float = 1.0
             if isinstance(value, str):
                 try:

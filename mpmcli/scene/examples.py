@@ -1,4 +1,4 @@
-"""The example scenes, which an installation holds as the checkout does."""
+"""The example scenes, in an installation as in a checkout."""
 
 import re
 import tomllib
@@ -15,7 +15,7 @@ def examples() -> dict[str, Path]:
 
 
 def caption(path: Path) -> str:
-    """Return what an example shows, as its header says."""
+    """Return the caption of an example from its header."""
     text = path.read_text(encoding="utf-8")
     said = re.search(r"^# What you will see: (.*?)^#$", text, re.MULTILINE | re.DOTALL)
     lines = said[1].splitlines() if said else []

@@ -1,9 +1,9 @@
-"""Presets and laws: what a scene says of a material as the table of a law, both as plain data, and the JSON Schema.
+"""Expands presets and knobs of a scene to tables of laws, as plain data, and makes the JSON Schema of scenes.
 
-A preset is a material by the name of the thing: a law and its parameters in SI units, each with its source, from
-presets.toml. A material is written `"honey"`, `{ preset = "honey", thickness = 0.7, density = 1400 }`, or
-`{ law = "fluid", ... }`. Presets are filled in, and knobs become parameters. What the scene says itself always wins
-over what its preset holds. With the JSON Schema of scenes editors complete them.
+A preset is a named material: a law and its parameters in SI units, each with its source, from presets.toml. A material
+is written `"honey"`, `{ preset = "honey", thickness = 0.7, density = 1400 }`, or `{ law = "fluid", ... }`. Presets are
+filled in, and knobs become parameters. Values in the scene take precedence over those of the preset. Editors use the
+JSON Schema to complete scenes.
 """
 
 import copy
@@ -29,7 +29,7 @@ class Value(NamedTuple):
 
 @dataclass(frozen=True)
 class Preset:
-    """One material: its law, what it looks like when it moves, and parameters; others have the law's default."""
+    """One material: its law, its look in motion, and its parameters; others have the law's default."""
 
     law: str
     shows: str
@@ -49,17 +49,17 @@ PRESETS = {
 
 @dataclass
 class Expansion:
-    """Parsed TOML whose materials are tables of laws; a material that is too faulty to go on with is None."""
+    """Parsed TOML whose materials are tables of laws; a material that cannot be expanded is None."""
 
     data: dict[str, Any]
     problems: list[Problem] = field(default_factory=list)  # of presets and knobs
     renames: Renames = field(default_factory=dict)  # path of each parameter that a knob set -> path of the knob
     faulty: set[Path] = field(default_factory=set)  # paths of the materials that are None
-    notes: dict[tuple[str, int], list[str]] = field(default_factory=dict)  # what each knob did, by table and index
+    notes: dict[tuple[str, int], list[str]] = field(default_factory=dict)  # effect of each knob, by table and index
 
 
 def expand_materials(data: dict[str, Any], laws: Laws) -> Expansion:
-    """Return parsed TOML, copied, with every material as its law's table; what is no material at all stays as it is."""
+    """Return a copy of parsed TOML with every material as its law's table; other values stay as they are."""
     expansion = Expansion(copy.deepcopy(data))
     for table in ("bodies", "emitters"):
         bodies = expansion.data.get(table)
@@ -87,7 +87,7 @@ class _Material:
         self.presets = available_presets(laws)
 
     def expanded(self, material: object) -> dict[str, Any] | None:
-        """Return the table of the law, or None after a problem without which it cannot be made."""
+        """Return the table of the law, or None after a problem that prevents it."""
         if isinstance(material, str):
             return self._table("preset", material, {}) if self._names("preset", material, self.path) else None
         if not isinstance(material, dict):
@@ -118,7 +118,7 @@ class _Material:
         return self._fault((*self.path, "law"), f"missing key: the constitutive law, {laws}; or a preset, {presets}")
 
     def _names(self, kind: str, word: str, path: Path) -> bool:
-        """Say whether a word names a law or a preset, as `kind` says; report a problem where it does not."""
+        """Return whether a word names a law or a preset, according to `kind`; report a problem if not."""
         laws, presets = sorted(self.laws), self.presets
         known, others = (laws, presets) if kind == "law" else (presets, laws)
         if word in known:
@@ -134,7 +134,7 @@ class _Material:
         return False
 
     def _table(self, kind: str, word: str, said: dict[str, Any]) -> dict[str, Any]:
-        """Return the table of a law, or of that of a preset with its values, and what the scene says itself."""
+        """Return the table of a law, or of a preset's law with its values, updated by the keys of the scene."""
         preset = PRESETS[word] if kind == "preset" else None
         law = preset.law if preset else word
         model = self.laws[law]
@@ -160,7 +160,7 @@ class _Material:
         return result
 
     def _foreign(self, key: str, law: str) -> str | None:
-        """Return what is wrong with a key that only other laws know, or None."""
+        """Return the fault of a key that only other laws have, or None."""
         fields, knobs = self.laws[law].model_fields, knobs_of(self.laws[law])
         if key in fields:
             return None
@@ -178,7 +178,7 @@ class _Material:
     def _turned(
         self, knob: Knob, position: object, parameter: str, model: type[MaterialParameters], preset: str
     ) -> float:
-        """Return the parameter that a knob sets; that of the middle after a problem, to find what else is wrong."""
+        """Return the parameter that a knob sets; that of position 0.5 after a problem, to find further problems."""
         path = (*self.path, knob.name)
         self.expansion.renames[(*self.path, parameter)] = path
         if isinstance(position, bool) or not isinstance(position, int | float) or not 0 <= position <= 1:
@@ -213,7 +213,7 @@ def json_schema(laws: Laws) -> dict[str, Any]:
     forms: list[dict[str, Any]] = [_one_of(presets, "A preset as it is.")] if presets else []
     for law in laws:
         word = law.model_fields["law"].default
-        # The name that pydantic gave its table: that of its class, or longer where two classes share it.
+        # The name that pydantic gave its table: the class name, or a longer one if two classes share it.
         own_law = {name: table.get("properties", {}).get("law", {}) for name, table in definitions.items()}
         key = next(name for name, inner in own_law.items() if inner.get("const") == word)
         table = definitions[key]
@@ -229,10 +229,10 @@ def json_schema(laws: Laws) -> dict[str, Any]:
     definitions["Body"]["properties"]["material"] = {"description": material["description"], "oneOf": forms}
     definitions["Domain"]["oneOf"] = [{"required": ["spacing"]}, {"required": ["cells"]}]
     schema["$defs"] = dict(sorted(definitions.items()))
-    # Not in the model of a scene: they are gone once it is read.
+    # Not in the model of a scene: reading removes them.
     text = {"type": "string"}
-    base = {**text, "description": "Path of a scene that this one begins with; tables here are merged into its tables."}
-    remove = {"type": "array", "items": text, "description": "Names of what the base has and this scene has not."}
+    base = {**text, "description": "Path of the base scene; tables here are merged into its tables."}
+    remove = {"type": "array", "items": text, "description": "Names of entries of the base to leave out."}
     schema["properties"] |= {"base": base, "remove": remove}
     schema["anyOf"] = [{"required": ["base"]}, {"required": schema.pop("required")}]
     return {"$schema": GenerateJsonSchema.schema_dialect, **schema}
@@ -248,7 +248,7 @@ def _one_of(presets: list[str], description: str) -> dict[str, Any]:
 def _preset_table(
     table: dict[str, Any], law: type[MaterialParameters], presets: list[str], name: str
 ) -> dict[str, Any]:
-    """Return the table of a preset: nothing but its name is needed, and its values are the defaults."""
+    """Return the table of a preset: only its name is required, and its values are the defaults."""
     others = {
         key: {word: value for word, value in inner.items() if word != "default"}
         for key, inner in table["properties"].items()
@@ -285,7 +285,7 @@ def _add_knobs(table: dict[str, Any], law: type[MaterialParameters]) -> None:
 
 
 def _without_null(schema: Any) -> Any:
-    """Drop null from a schema: TOML cannot write it, so it is only our word for "not given"."""
+    """Drop null from a schema: TOML has no null; here it means "not given"."""
     if isinstance(schema, list):
         return [_without_null(entry) for entry in schema]
     if not isinstance(schema, dict):
@@ -297,7 +297,7 @@ def _without_null(schema: Any) -> Any:
     return kept
 
 
-# JSON Schema's words for the ends of a range, and how they are written.
+# JSON Schema keywords for the ends of a range, and their notation.
 _ENDS = {"minimum": ">=", "exclusiveMinimum": ">", "maximum": "<=", "exclusiveMaximum": "<"}
 
 
@@ -325,7 +325,7 @@ def law_facts(model: type[MaterialParameters]) -> dict[str, Any]:
 
 
 def preset_facts(name: str, model: type[MaterialParameters]) -> dict[str, Any]:
-    """Return a preset's law, its values with their sources, and where its knobs stand; `model` is that of its law."""
+    """Return a preset's law, its values with their sources, and its knob positions; `model` is that of its law."""
     preset = PRESETS[name]
     return {
         "name": name,
@@ -345,7 +345,7 @@ def preset_facts(name: str, model: type[MaterialParameters]) -> dict[str, Any]:
 
 
 def knob_facts(model: type[MaterialParameters], values: dict[str, Any] | None = None) -> list[dict[str, Any]]:
-    """Return the knobs of a law: what each sets, on which scale, and where it stands for `values` or the defaults."""
+    """Return the knobs of a law: the parameter and scale of each, and its position for `values` or the defaults."""
     facts = []
     for name, (parameter, knob) in knobs_of(model).items():
         field = model.model_fields[parameter]
@@ -358,7 +358,7 @@ def knob_facts(model: type[MaterialParameters], values: dict[str, Any] | None = 
 
 
 def _range(schema: dict[str, Any]) -> str:
-    """Write what JSON Schema accepts: `> 0 or "auto"`, `> -1, < 0.5`, `true or false`."""
+    """Write the accepted values of a JSON Schema: `> 0 or "auto"`, `> -1, < 0.5`, `true or false`."""
     if "anyOf" in schema:
         return listed([_range(one) for one in schema["anyOf"]])
     if "const" in schema:

@@ -1,4 +1,4 @@
-"""Expressions as trees of named quantities: their value, bounds on it, and their slope; one row for each function.
+"""Expressions as trees of named quantities: value, bounds and derivative; one table row for each function.
 
 `expression_reader` reads them from text; `solver.drive.expressions` has each function in a kernel, by the same name.
 
@@ -16,12 +16,12 @@ from typing import Literal
 
 import numpy as np
 
-# Names whose value changes within a step, from particle to particle.
+# Names whose value varies within a step, from particle to particle.
 POSITION = ("x", "y", "z")
 INITIAL = ("X", "Y", "Z")
 QUANTITIES = ("t", *POSITION, *INITIAL)
 CONSTANTS = {"pi": math.pi, "e": math.e}
-# Arguments that a function of any number of them takes at most.
+# Largest number of arguments of a variadic function.
 MANY = 64
 
 Kind = Literal["number", "truth"]
@@ -30,7 +30,7 @@ Interval = tuple[np.ndarray, np.ndarray]
 
 
 class ExpressionError(ValueError):
-    """What is wrong with an expression, and what would be right."""
+    """A fault of an expression, and its correction."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Name:
 
 @dataclass(frozen=True)
 class Apply:
-    """An operator or a function and what it is applied to."""
+    """An operator or a function, and its arguments."""
 
     function: str
     arguments: tuple["Tree", ...]
@@ -61,7 +61,7 @@ ZERO, ONE = Number(0.0), Number(1.0)
 
 @dataclass(frozen=True)
 class Expression:
-    """An expression of at least one name: its text with constants put in, what it means, and what was written."""
+    """An expression of at least one name: its text with constants inserted, its tree, and the text as written."""
 
     text: str
     tree: Tree = field(compare=False, repr=False)
@@ -92,7 +92,7 @@ def _evaluate(tree: Tree, values: Mapping[str, np.ndarray | float]) -> np.ndarra
 
 
 def bounds_of(tree: Tree, ranges: Mapping[str, Interval]) -> Interval:
-    """Return bounds on a tree where each name lies within its range; an end that is not known is infinite."""
+    """Return bounds on a tree where each name lies within its range; an unknown end is infinite."""
     with np.errstate(all="ignore"):
         low, high = _bounds(tree, ranges)
     return _known(*np.broadcast_arrays(np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)))
@@ -124,12 +124,12 @@ def names_in(tree: Tree) -> frozenset[str]:
 
 
 def kind_of(tree: Tree) -> Kind:
-    """Say whether a tree is a number or a truth value."""
+    """Return whether a tree is a number or a truth value."""
     return _function(tree).result if isinstance(tree, Apply) else "number"
 
 
 def apply(function: str, *arguments: Tree) -> Tree:
-    """Return a function applied to trees; without names it is computed at once, if that gives a finite number."""
+    """Return a function applied to trees; constant arguments are evaluated at once if the value is finite."""
     made = Apply(function, arguments)
     if kind_of(made) == "number" and not names_in(made):
         value = float(evaluate(made, {}))
@@ -158,7 +158,7 @@ def _function(tree: Apply) -> Function:
 
 
 def _step(x: np.ndarray) -> np.ndarray:
-    """Heaviside's function, 1 at 0; not a number stays so."""
+    """Heaviside's function, 1 at 0; nan stays nan."""
     return np.where(np.isnan(x), x, np.where(np.greater_equal(x, 0), 1.0, 0.0))
 
 
@@ -166,19 +166,19 @@ def _step(x: np.ndarray) -> np.ndarray:
 
 
 def _known(low: np.ndarray, high: np.ndarray, unknown: np.ndarray | None = None) -> Interval:
-    """Return an interval whose ends are infinite where they are not known: by default, where they are no number."""
+    """Return an interval whose unknown ends are infinite; by default nan ends are unknown."""
     no_low, no_high = (np.isnan(low), np.isnan(high)) if unknown is None else (unknown, unknown)
     return np.where(no_low, -np.inf, low), np.where(no_high, np.inf, high)
 
 
 def _hull(*values: np.ndarray) -> Interval:
-    """Return the smallest interval that holds some values; one that is not a number counts as unknown."""
+    """Return the smallest interval that contains the values; nan counts as unknown."""
     stacked = np.stack(np.broadcast_arrays(*values))
     return _known(stacked.min(axis=0), stacked.max(axis=0), np.isnan(stacked).any(axis=0))
 
 
 def _rising(compute: Callable[..., np.ndarray]) -> Callable[[Interval], Interval]:
-    """Return the rule of a function that never falls; outside its domain nothing is known."""
+    """Return the rule of a nondecreasing function; outside its domain the bounds are unknown."""
     return lambda a: _known(compute(a[0]), compute(a[1]))
 
 
@@ -213,12 +213,12 @@ def _power(a: Interval, b: Interval) -> Interval:
     even = fixed & whole & (b[0] % 2 == 0)
     crosses = (a[0] <= 0) & (a[1] >= 0)
     low = np.where(even & crosses & (b[0] >= 0), np.minimum(ends[0], 0.0), ends[0])
-    # At a pole. A negative base with a power that is not whole is not a number, and one that varies may be anything.
+    # At a pole. A negative base to a power that is not whole is nan; with a varying power nothing is known.
     return _known(low, ends[1], unknown=(crosses & (b[0] < 0)) | ((a[0] < 0) & ~(fixed & whole)))
 
 
 def _sine(a: Interval, shift: float = 0.0) -> Interval:
-    """Return the range of sin(a + shift), with the peaks that lie within."""
+    """Return the range of sin(a + shift), including the peaks within a."""
     low, high = a[0] + shift, a[1] + shift
     ends = np.sin(low), np.sin(high)
     turn = 2 * math.pi
@@ -251,7 +251,7 @@ def _acos(a: Interval) -> Interval:
 
 def _atan2(a: Interval, b: Interval) -> Interval:
     ends = _hull(*(np.arctan2(y, x) for y in a for x in b))
-    # Across the negative x axis it jumps; around the origin it is anything.
+    # It jumps across the negative x axis and takes every value around the origin.
     cut = (b[0] <= 0) & (a[0] <= 0) & (a[1] >= 0)
     return np.where(cut, -math.pi, ends[0]), np.where(cut, math.pi, ends[1])
 
@@ -283,7 +283,7 @@ def _choice(condition: Interval, a: Interval, b: Interval) -> Interval:
     return low, np.where(sure, a[1], np.where(never, b[1], np.maximum(a[1], b[1])))
 
 
-# Slopes; the trees of sums and products are without their zeros and ones.
+# Slopes; zeros and ones are removed from the trees of sums and products.
 
 
 def plus(a: Tree, b: Tree) -> Tree:
@@ -309,9 +309,9 @@ def squared(a: Tree) -> Tree:
 
 
 def _chained(outer: Tree, inner: Tree) -> Tree:
-    """Return the product of two slopes, 0 where the inner one is, though the outer one may be infinite there.
+    """Return the product of two slopes, 0 where the inner one is 0, although the outer one may be infinite there.
 
-    So it is at the tip of hypot(X, Y), and where max(X, 0)**0.5 is flat.
+    Examples are the tip of hypot(X, Y) and the flat part of max(X, 0)**0.5.
     """
     if isinstance(inner, Number):
         return times(outer, inner)
@@ -319,7 +319,7 @@ def _chained(outer: Tree, inner: Tree) -> Tree:
 
 
 def _power_slope(f: Tree, a: Tree, b: Tree, da: Tree, db: Tree) -> Tree:
-    # b a^(b-1) a' + a^b log(a) b', each left out where it is 0, as it may not exist there.
+    # b a^(b-1) a' + a^b log(a) b', each term omitted where it is 0, because it may be undefined there.
     return plus(_chained(times(b, apply("**", a, minus(b, ONE))), da), _chained(times(f, apply("log", a)), db))
 
 
@@ -330,7 +330,7 @@ def _clamp_slope(f: Apply, *slopes: Tree) -> Tree:
 
 
 def _extreme(sign: str, values: tuple[Tree, ...], slopes: tuple[Tree, ...]) -> Tree:
-    """Return the slope of the extreme of some values: that of the value that is chosen."""
+    """Return the slope of the extreme of some values: the slope of the chosen value."""
     value, slope = values[0], slopes[0]
     for other, its_slope in zip(values[1:], slopes[1:], strict=True):
         chosen = Apply(sign, (value, other))
@@ -345,7 +345,7 @@ def _extreme(sign: str, values: tuple[Tree, ...], slopes: tuple[Tree, ...]) -> T
 def _of_one(
     compute: Callable[..., np.ndarray], slope: Callable[[Tree, Tree], Tree], bounds: Callable | None = None
 ) -> Function:
-    """Return the row of f(u), which never falls by default; `slope` is its derivative by u, from u and f."""
+    """Return the row of f(u), nondecreasing by default; `slope` is its derivative by u, from u and f."""
     return Function(
         compute, bounds or _rising(compute), lambda f, du: _chained(slope(f.arguments[0], f), du), least=1, most=1
     )

@@ -1,8 +1,7 @@
-"""Reads expressions from text, which is never run as Python.
+"""Reads expressions from text; the text is never run as Python.
 
-Python's parser splits the text, and of what it returns only what stands in the tables of `expression` is taken. A
-comparison is true or false and no number: it may stand where a condition is needed, in `a if c else b`, `and`, `or` and
-`not`, and nowhere else.
+Python's parser splits the text; only nodes in the tables of `expression` are accepted. A comparison is a truth value,
+not a number: it is allowed only where a condition is needed, in `a if c else b`, `and`, `or` and `not`.
 """
 
 import ast
@@ -31,7 +30,7 @@ from mpmcli.scene.expression import (
 )
 from mpmcli.scene.problem import listed
 
-# An expression of a scene is a formula that a person has written; kernels hold all of it.
+# Limits for formulas written by hand; kernels contain the whole expression.
 MOST_CHARACTERS = 2000
 MOST_NESTED = 60
 TOO_DEEP = f"is nested more than {MOST_NESTED} deep, each term of a sum counted; write it shorter"
@@ -51,9 +50,9 @@ _INSTEAD = {
 def parse(
     text: str, names: Collection[str], constants: Mapping[str, ast.expr] = MappingProxyType({})
 ) -> Expression | float:
-    """Read an expression of some names, and of constants that stand for others; its value where it depends on nothing.
+    """Read an expression of the given names and constants; return its value if it depends on no name.
 
-    The sentence of an ExpressionError goes on after the place of the value.
+    The message of an ExpressionError continues a sentence that begins with the place of the value.
     """
     if len(text) > MOST_CHARACTERS:
         raise ExpressionError(f"is too long for an expression: {len(text)} characters, {MOST_CHARACTERS} at most")
@@ -67,9 +66,9 @@ def parse(
     except SyntaxError as error:
         near = source[max(0, (error.offset or 1) - 1) :][:12].strip()
         place = f' near "{near}"' if near else " at its end"
-        raise ExpressionError(f'is no expression: "{_cut(source)}" cannot be read{place}') from None
+        raise ExpressionError(f'is not an expression: "{_cut(source)}" cannot be read{place}') from None
     except (ValueError, RecursionError, MemoryError):
-        raise ExpressionError("is no expression: it cannot be read") from None
+        raise ExpressionError("is not an expression: it cannot be read") from None
     expanded = text
     used = Counter(node.id for node in ast.walk(parsed) if isinstance(node, ast.Name) and node.id in constants)
     for name in used:
@@ -94,7 +93,7 @@ def parse(
 
 
 class _PutIn(ast.NodeTransformer):
-    """Replaces constants by what they stand for; what is called keeps its name."""
+    """Replaces constants by their expressions; names of called functions stay."""
 
     def __init__(self, constants: Mapping[str, ast.expr]) -> None:
         self.constants = constants
@@ -112,7 +111,7 @@ def _cut(text: str) -> str:
 
 
 class _Reader:
-    """Turns what Python's parser returns into a tree, or into a sentence on what has no place in an expression."""
+    """Converts the nodes of Python's parser to a tree, or raises an ExpressionError for a node that is not allowed."""
 
     def __init__(self, source: str, names: tuple[str, ...]) -> None:
         self.source = source
@@ -176,7 +175,7 @@ class _Reader:
         operator = getattr(node, "op", None)
         instead = f"; {_INSTEAD[type(operator)]}" if type(operator) in _INSTEAD else ""
         raise ExpressionError(
-            f'cannot hold "{self._said(node)}"{instead or "; it takes numbers, names, + - * / ** %, comparisons, "}'
+            f'cannot contain "{self._said(node)}"{instead or "; it takes numbers, names, + - * / ** %, comparisons, "}'
             f"{'' if instead else '`a if c else b` and functions'}"
         )
 
@@ -198,7 +197,7 @@ class _Reader:
         if name in self.names:
             return Name(name)
         if name in FUNCTIONS:
-            raise ExpressionError(f'needs what "{name}" is to be taken of: {name}(...)')
+            raise ExpressionError(f'needs the argument of "{name}": {name}(...)')
         if {"z": "y", "Z": "Y"}.get(name) in self.names:
             raise ExpressionError(
                 f'has no "{name}" in a 2D scene; the names here are {listed(list(self.names), "and")}'
@@ -207,15 +206,15 @@ class _Reader:
 
     def _call(self, node: ast.Call, depth: int) -> Tree:
         if not isinstance(node.func, ast.Name):
-            raise ExpressionError(f'cannot hold "{self._said(node)}"; a function is called by its name')
+            raise ExpressionError(f'cannot contain "{self._said(node)}"; a function is called by its name')
         name = node.func.id
         if name not in FUNCTIONS:
             if name in CONSTANTS or name in self.names:
-                raise ExpressionError(f'takes "{name}" for a function, and it is none; a product is written with *')
+                raise ExpressionError(f'takes "{name}" for a function, which it is not; a product is written with *')
             raise ExpressionError(_unknown("function", name, FUNCTIONS, tuple(FUNCTIONS)))
         function = FUNCTIONS[name]
         if node.keywords or any(isinstance(a, ast.Starred) for a in node.args):
-            raise ExpressionError(f'cannot hold "{self._said(node)}"; arguments are numbers in their order')
+            raise ExpressionError(f'cannot contain "{self._said(node)}"; arguments are numbers in their order')
         count = len(node.args)
         if not function.least <= count <= function.most:
             need = f"{function.least}" if function.least == function.most else f"at least {function.least}"
@@ -225,7 +224,7 @@ class _Reader:
 
 
 def _unknown(kind: str, word: str, shown: Collection[str], known: tuple[str, ...]) -> str:
-    # A name that differs in its case alone is nearest.
+    # A name that differs only in case is nearest.
     cased = [one for one in known if one.lower() == word.lower()]
     guess = next(iter(cased or difflib.get_close_matches(word, known, n=1)), None)
     hint = f'did you mean "{guess}"? ' if guess else ""

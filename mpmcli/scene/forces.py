@@ -1,4 +1,4 @@
-"""What pushes bodies beside gravity: accelerations, forces, pushes near a place, and other bodies that they meet."""
+"""Loads on bodies besides gravity: accelerations, forces, impulses near a place, and contact with other bodies."""
 
 from typing import Literal
 
@@ -10,33 +10,35 @@ from mpmcli.scene.expression_reader import parse
 from mpmcli.scene.primitives import Ball, Box
 from mpmcli.scene.quantity import NAME, NotNegative, Number, Positive, Table, Vector, flaw
 
-# What is left of a push at a distance r, in radii; nothing beyond 1. A Gaussian has a third as its standard deviation.
-# The pushes of an impulse are forces, whose means are exact.
+# Factor of a push at a distance r, in radii; 0 beyond 1. The standard deviation of the Gaussian is a third. An impulse
+# becomes forces, whose means over a step are exact.
 FALLOFF = {"none": "1", "linear": "(1 - sqrt({r2}))", "gaussian": "exp(-4.5 * {r2})"}
-# Length of an impulse at a time, as a part of the interval between frames.
+# Duration of an impulse without an end, as a fraction of the interval between frames.
 INSTANT = 1e-3
 # Radii around the centre in which a radial push falls to zero.
 CORE = 1e-3
 
 
 class Impulse(Table):
-    """A push on what is within a radius of a place, as a hand gives it."""
+    """A push on all particles within a radius of a place."""
 
     name: str | None = Field(None, pattern=NAME, description="Name of the impulse, for --set.")
     body: str | None = Field(None, description="Name of the body or rigid body that it acts on. Default: all of them.")
-    start: NotNegative = Field(description="When it begins, s.")
+    start: NotNegative = Field(description="Start, s.")
     end: Positive | None = Field(
-        None, description="When it ends, s. Default: a thousandth of the interval between frames after it begins."
+        None, description="End, s. Default: a thousandth of the interval between frames after the start."
     )
-    center: Vector = Field(description="Where it is strongest, m.")
+    center: Vector = Field(description="Place of its largest strength, m.")
     radius: Positive = Field(description="Distance from the centre beyond which nothing is pushed, m.")
     strength: Number = Field(
-        description="Change of velocity at the centre in all, m/s; a negative one pulls, or pushes backwards."
+        description="Total change of velocity at the centre, m/s; negative values pull or push backwards."
     )
-    direction: Vector | None = Field(None, description="Of the push, of any length. Default: away from the centre.")
+    direction: Vector | None = Field(
+        None, description="Direction of the push, of any length. Default: away from the centre."
+    )
     falloff: Literal["none", "linear", "gaussian"] = Field(
         "linear",
-        description="How the push falls with the distance: not at all, linearly to the radius, or as a Gaussian.",
+        description="Decay of the push with distance: none, linear to the radius, or Gaussian.",
     )
 
     @model_validator(mode="after")
@@ -64,7 +66,7 @@ class Impulse(Table):
 
 
 class Region(Table):
-    """A part of a body by where its particles start: a box or a ball."""
+    """A part of a body: the particles that start in a box or a ball."""
 
     box: Box | None = Field(None, description="Box with sides along the axes.")
     ball: Ball | None = Field(None, description="Disc (2D) or ball (3D).")
@@ -90,7 +92,7 @@ class Region(Table):
 
 
 class Force(Table):
-    """An acceleration that acts on one body, or on all of them; or a force that is spread over the mass of one."""
+    """An acceleration of one body or of all bodies; or a force that is spread over the mass of one body."""
 
     name: str | None = Field(None, pattern=NAME, description="Name of the force, for --set.")
     body: str | None = Field(None, description="Name of the body or rigid body that it acts on. Default: all of them.")
@@ -105,7 +107,7 @@ class Force(Table):
         "body, or of its part in the region.",
     )
     region: Region | None = Field(
-        None, description="Where a particle starts that it acts on: a box or a ball. Default: anywhere."
+        None, description="Box or ball in which the particles that it acts on start. Default: all particles."
     )
 
     @model_validator(mode="after")
@@ -119,7 +121,7 @@ class Force(Table):
         return self
 
     def spread(self, mass: float) -> "Force":
-        """Return it as an acceleration, where the particles that it acts on have this mass, kg."""
+        """Return it as an acceleration; `mass` is that of the particles that it acts on, kg."""
         given = self.acceleration if self.force is None else self.force
         scale = "" if self.force is None else f" * {1 / mass!r}"
         where = f" if {self.region.condition} else 0" if self.region else ""
@@ -131,16 +133,16 @@ class Force(Table):
 
 
 class ContactPair(Table):
-    """What two bodies do to each other where they meet, whatever others do."""
+    """Contact of two bodies; overrides that of the scene."""
 
     between: tuple[str, str] = Field(description="Names of the two bodies.")
     friction: NotNegative | Literal["stick"] = Field(
-        description='Coefficient of Coulomb friction between them, so that they separate; "stick": they do not.'
+        description='Coefficient of Coulomb friction between them, which can separate; "stick": they cannot.'
     )
 
 
 class Contact(Table):
-    """What bodies do to each other where they meet."""
+    """Contact between bodies."""
 
     default: Literal["stick", "separate"] = Field(
         "stick",
@@ -152,4 +154,4 @@ class Contact(Table):
     friction: NotNegative | None = Field(
         None, description="Coefficient of Coulomb friction. Default: the softer body's, `surface_friction`."
     )
-    pairs: tuple[ContactPair, ...] = Field((), description="Pairs of bodies that do something else.")
+    pairs: tuple[ContactPair, ...] = Field((), description="Pairs of bodies with contact of their own.")

@@ -1,6 +1,6 @@
-"""From a TOML file to a complete scene, or to one error that names everything wrong with it.
+"""Loads a complete scene from a TOML file, or raises one error that lists every fault.
 
-A scene may begin with another one: `base = "other.toml"`, and what of it is changed, added and removed.
+A scene may extend another one: `base = "other.toml"`, with changes, additions and removals.
 """
 
 from collections.abc import Mapping, Sequence
@@ -42,10 +42,10 @@ from mpmcli.scene.toml_file import apply_overrides, copied, key_lines, line_of, 
 def repaired(
     data: dict[str, Any], unknown: list[Path], model: type[BaseModel]
 ) -> tuple[set[Path], dict[str, Any], Renames]:
-    """Return the paths of keys at pydantic's locations `unknown`, the data without them, and which got other names.
+    """Return the paths of keys at pydantic's locations `unknown`, the data without them, and the renamed keys.
 
-    A misspelled key is taken for its nearest neighbour, any other is dropped. Only to find what else is wrong; a scene
-    with an unknown key is always refused.
+    A misspelled key is renamed to its nearest neighbour; any other is dropped. The result serves only to find further
+    faults: a scene with an unknown key is always refused.
     """
     paths: set[Path] = set()
     renames: Renames = {}
@@ -63,13 +63,13 @@ def repaired(
 
 
 def original_path(path: Path, renames: Renames) -> Path:
-    """Return a path in repaired data as it is in the scene as it was written."""
+    """Return the path in the scene as written of a path in repaired data."""
     found = nearest_entry(path, renames)
     return path if found is None else (*found[0], *found[1])
 
 
 def _as_written(problems: list[Problem], *renames: Renames) -> list[Problem]:
-    """Return problems at their paths in the scene as it was written; of several renames the latest come first."""
+    """Return problems at their paths in the scene as written; the latest renames come first."""
     for one in renames:
         problems = [Problem(original_path(p.path, one), p.sentence) for p in problems]
     return problems
@@ -77,7 +77,7 @@ def _as_written(problems: list[Problem], *renames: Renames) -> list[Problem]:
 
 @dataclass(frozen=True)
 class LoadedScene:
-    """A complete scene and what was chosen on the way to it.
+    """A complete scene and the choices made while loading it.
 
     Attributes:
         scene: the scene, with no "auto" left in its materials.
@@ -99,7 +99,7 @@ def load_scene(path: str | PathLike[str], overrides: Sequence[str] = (), *, laws
         laws: parameter models of the constitutive laws that a material may follow.
 
     Raises:
-        InputError: one line per fault: `FILE:LINE: KEY PATH: what is wrong and what would be right`.
+        InputError: one line per fault: `FILE:LINE: KEY PATH: fault and correction`.
     """
     text, data = read_scene(path)
     directory = File(path).parent
@@ -165,7 +165,7 @@ def _validate(
 ) -> tuple[Scene | None, list[Problem], dict[tuple[str, int], list[str]]]:
     """Expand and validate until no key is unknown, so that a misspelled key does not hide other faults.
 
-    Returns the scene, what is wrong with it at the user's own paths, and what the knobs of each body did.
+    Returns the scene, its problems at the user's own paths, and the effects of the knobs of each body.
     """
     model = scene_model(laws)
     problems: list[Problem] = []
@@ -182,7 +182,7 @@ def _validate(
             scene = model.model_validate(expansion.data, context=context)
         except ValidationError as error:
             unknown = [one["loc"] for one in error.errors() if one["type"] == "extra_forbidden"]
-            # What lies in a faulty material has its problem already.
+            # A faulty material has a problem already.
             found = [p for p in problems_of(error, expansion.data, model) if p.path[:3] not in expansion.faulty]
         if not unknown:
             found += expansion.problems + (problems_in(scene) if scene is not None else [])
@@ -193,7 +193,7 @@ def _validate(
 
 
 def _with_accelerations(scene: Scene) -> Scene:
-    """Turn forces, and what acts in a region, into accelerations that depend on where a particle starts."""
+    """Convert forces, and loads on a region, to accelerations that depend on the start of a particle."""
     forces = []
     for force in scene.forces:
         if force.force is None and force.region is None:
@@ -212,11 +212,11 @@ def _with_accelerations(scene: Scene) -> Scene:
 def report(
     problems: list[Problem], source: str, text: str, overridden: Mapping[Path, str] = MappingProxyType({})
 ) -> str:
-    """Write problems line by line, in the order of the file that they are in.
+    """Write problems one per line, in the order of the file.
 
     Args:
-        problems: what is wrong.
-        source: the file as it was given, or what to call it.
+        problems: the problems.
+        source: the file as it was given, or a name for it.
         text: its TOML text, for line numbers.
         overridden: texts of the overrides by the paths that they set.
     """
@@ -229,10 +229,10 @@ def report(
 
 
 def read_scene(path: str | PathLike[str], seen: Sequence[File] = ()) -> tuple[str, dict[str, Any]]:
-    """Return the text of a scene and what it holds, merged with its base; the text is empty where it has one.
+    """Return the text of a scene and its parsed data, merged with its base; with a base the text is empty.
 
     Raises:
-        InputError: a file cannot be read or is no TOML, a base is its own, or what is to be removed is not there.
+        InputError: a file cannot be read or is not TOML, a base contains itself, or a name to remove does not exist.
     """
     text, data = read_toml(path)
     name, remove = data.pop("base", None), data.pop("remove", [])
@@ -293,7 +293,7 @@ def merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
 
 
 def _moved(tree: Any, directory: File) -> Any:
-    """Return tables whose files are relative to a directory, as seen from where that is."""
+    """Return tables in which file paths relative to `directory` are prefixed with it."""
     if isinstance(tree, list):
         return [_moved(one, directory) for one in tree]
     if not isinstance(tree, dict):

@@ -1,4 +1,4 @@
-"""What a law's parameters are: their model, the knobs that set them, and their units."""
+"""Parameters of a law: their model, the knobs that set them, and their units."""
 
 import math
 import re
@@ -14,18 +14,18 @@ from mpmcli.scene.quantity import Positive
 
 @dataclass(frozen=True)
 class Knob:
-    """A word, and a position from 0 to 1, for one parameter of a law.
+    """A word and a position from 0 to 1 that set one parameter of a law.
 
-    It is an entry of the metadata of that parameter:
+    It belongs to the metadata of that parameter:
     `viscosity: Annotated[NotNegative, Knob("thickness", 1e-3, 1e2, "...")] = Field(0.0, description=...)`.
 
     Attributes:
-        name: the key that a scene says.
+        name: the key in a scene.
         low: value of the parameter at position 0, in its own unit.
         high: value at position 1; below `low` where the word means less of the parameter.
-        meaning: what some positions are like, a sentence without its full stop.
-        scale: equal steps of a logarithmic knob multiply the parameter, of a linear one add to it.
-        excludes: further parameters that settle the same thing, so that the knob is refused beside them.
+        meaning: description of some positions, a sentence without its full stop.
+        scale: equal steps of a logarithmic knob multiply the parameter; those of a linear one add to it.
+        excludes: further parameters that fix the same quantity; the knob is refused beside them.
     """
 
     name: str
@@ -46,7 +46,7 @@ class Knob:
         return float(self.low ** (1 - position) * self.high**position)
 
     def position(self, value: float) -> float | None:
-        """Return where the knob stands for a value of the parameter, or None where that is beyond its ends."""
+        """Return the position of the knob for a value of the parameter, or None if the value is beyond its ends."""
         low, high, x = self.low, self.high, value
         if not min(low, high) <= x <= max(low, high):
             return None
@@ -69,7 +69,7 @@ def knobs_of(model: type[BaseModel]) -> dict[str, tuple[str, Knob]]:
     }
 
 
-# After a comma: kg/m^3, Pa s, degrees, ...; then the sentence ends or goes on after a mark.
+# After a comma: kg/m^3, Pa s, degrees, ...; then the sentence ends, or continues after a punctuation mark.
 _SYMBOL = r"(?:kg|Pa|mol|degrees|rad|[mskJNKW1])(?:\^(?:-?\d+|n))?"
 _UNIT = re.compile(rf", ({_SYMBOL}(?:[ /]{_SYMBOL})*)(?=[.,;:)]|$)")
 
@@ -82,7 +82,7 @@ def unit_of(description: str | None) -> str:
 
 @dataclass(frozen=True)
 class SceneBounds:
-    """What a scene can reach, from its initial state alone.
+    """Bounds on the state that a scene can reach, from its initial state alone.
 
     Attributes:
         dimension: 2 or 3.
@@ -90,7 +90,7 @@ class SceneBounds:
         gravity: magnitude of gravity, m/s^2.
         speed: highest speed that any particle can reach, m/s, from initial speeds and fall height.
         height: extent of the matter along gravity that can press on its lowest point, m.
-        density: the largest at rest of any body, kg/m^3: what may press on the others.
+        density: largest density at rest of any body, kg/m^3, for the pressure on the others.
     """
 
     dimension: int
@@ -108,7 +108,7 @@ class Internal(NamedTuple):
         name: of the output field that shows it.
         at_rest: its value at the start, and in that field for particles of laws without it.
         description: what it is, with its unit.
-        dimensions: where a particle has it.
+        dimensions: dimensions of scenes in which a particle has it.
     """
 
     name: str
@@ -121,15 +121,15 @@ class MaterialParameters(BaseModel):
     """Parameters of a constitutive law, as written in a scene; one subclass per law.
 
     A subclass narrows `law` to a Literal with a default and adds its own parameters, each with a
-    range and a description that names its unit. Validation is strict: "1000" and true are no numbers.
+    range and a description that names its unit. Validation is strict: "1000" and true are not numbers.
 
     Attributes:
-        sets: of parameters that are other words for one of the law, the name of that.
-        internal: what a particle stores beside its deformation.
-        stores: what it stores of its deformation, "J" or "F", as the law says that these parameters belong to.
+        sets: for each parameter that is an alias, the name of the law's parameter.
+        internal: variables that a particle stores besides its deformation.
+        stores: the stored deformation measure, "J" or "F", as for the law of these parameters.
         elastic: whether its stress is a function of F alone.
         hydrostatic: whether it is a fluid whose J follows from the pressure, by `volume_ratio_under`.
-        solid: whether a body of it keeps its shape, so that it stays where it stands.
+        solid: whether a body of it keeps its shape, so that it stays in place.
         usual_sampling: of its bodies; "turned" where it flows far and its particles are not shifted.
     """
 
@@ -156,7 +156,7 @@ class MaterialParameters(BaseModel):
         return self, []
 
     def volume_ratio_under(self, load: np.ndarray) -> np.ndarray:
-        """Return the J, (n,), at which the material at rest has J p = `load`, (n,), Pa; nan where none does."""
+        """Return the J, (n,), at which the material at rest has J p = `load`, (n,), Pa; nan where there is none."""
         raise NotImplementedError
 
 

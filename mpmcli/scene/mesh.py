@@ -1,4 +1,4 @@
-"""A body in the form of a closed mesh from a file: welded, closed, facing outwards.
+"""Bodies given by a closed mesh from a file: welded, closed, facing outwards.
 
 Closed surfaces of triangles: volume, inside test, and signed distance of points.
 """
@@ -16,7 +16,7 @@ from mpmcli.scene.points import GeometryFileError, file_version, read_geometry, 
 from mpmcli.scene.primitives import Solid, grid_points, rotation
 from mpmcli.scene.quantity import Axis, Number, Positive, Table, Vector, flaw, place_text
 
-# Points, and pairs of a point and a triangle, that are looked at together: bounds the memory, keeps pairs in the cache.
+# Points, and pairs of a point and a triangle, per batch: bounds the memory and keeps pairs in the cache.
 POINTS_AT_ONCE = 200_000
 _PAIRS_AT_ONCE = 50_000
 # Points whose distance VTK computes in one call.
@@ -29,7 +29,7 @@ _BINS = 1024
 
 
 class Crossings(NamedTuple):
-    """Where lines along z meet the surface: number of the line, z (m), and 1 where it faces up, else -1, (c,)."""
+    """Crossings of lines along z with the surface: number of the line, z (m), and 1 if it faces up, else -1, (c,)."""
 
     line: np.ndarray
     z: np.ndarray
@@ -38,7 +38,7 @@ class Crossings(NamedTuple):
 
 @dataclass(eq=False)
 class ClosedSurface:
-    """A closed surface of triangles: every edge has two of them, which pass it in opposite directions."""
+    """A closed surface of triangles: every edge belongs to two triangles with opposite directions along it."""
 
     vertices: np.ndarray  # (n, 3), m
     triangles: np.ndarray  # (m, 3), indices of their vertices, counter-clockwise seen from outside
@@ -87,7 +87,7 @@ class ClosedSurface:
             near = np.flatnonzero(found < _NEAR * np.ptp(self.bounds(), axis=0).max())
         else:
             found, near = np.empty(len(points)), np.arange(len(points))
-        # A signal is seen between two calls.
+        # Signals are handled between two calls.
         for some in np.array_split(near, len(near) // _VTK_AT_ONCE + 1):
             exact = vtkDoubleArray()
             self._vtk_distance.FunctionValue(numpy_to_vtk(np.ascontiguousarray(points[some], np.float64)), exact)
@@ -118,7 +118,7 @@ class ClosedSurface:
         return KDTree(points[np.unique(np.floor(points / edge), axis=0, return_index=True)[1]])
 
     def crossings(self, lines: np.ndarray) -> Crossings:
-        """Return where lines along z at some x, y, (n, 2), meet the surface; n and the crossings have to fit in memory.
+        """Return where lines along z at some x, y, (n, 2), meet the surface; n and the crossings must fit in memory.
 
         A line meets a triangle if a ray from it along x passes edges of the triangle, seen along z, more often upwards
         than downwards, or the other way round. Both triangles of an edge compute its passage in the same way, so that
@@ -126,7 +126,7 @@ class ClosedSurface:
         """
         raster = self._raster
         bins = raster.bins(lines) @ (raster.count, 1)
-        # Where in the list those near each line begin, and how many they are.
+        # Start and number of the triangles near each line in the list.
         first, count = raster.starts[bins], raster.starts[bins + 1] - raster.starts[bins]
         step = max(1, int(_PAIRS_AT_ONCE * len(lines) / max(int(count.sum()), _PAIRS_AT_ONCE)))
         parts = [
@@ -152,7 +152,7 @@ class ClosedSurface:
         line, corners = line[met], self.corners[triangle[met]]
         a = corners[:, 0]
         normal = np.cross(corners[:, 1] - a, corners[:, 2] - a)
-        # A triangle that is upright up to rounding is met at any height of its own.
+        # A line meets a triangle that is vertical up to rounding at any of its heights.
         upright = np.where(normal[:, 2] == 0, 1.0, normal[:, 2])
         z = a[:, 2] - np.einsum("ij,ij->i", lines[line] - a[:, :2], normal[:, :2]) / upright
         return Crossings(line, np.clip(z, corners[:, :, 2].min(axis=1), corners[:, :, 2].max(axis=1)), turn[met])
@@ -185,7 +185,7 @@ class _Raster:
         return np.clip((places - self.lower) / self.width, 0, self.count - 1).astype(np.int64)
 
 
-# Points per axis at which the surface is tried for parts that overlap or are inside out.
+# Points per axis at which the surface is tested for parts that overlap or are inside out.
 _TRIED = 24
 
 
@@ -209,25 +209,25 @@ def read_mesh(
 
 
 def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Return points (n, 3) and triangles (m, 3) of the surface of what a file holds; points at one place are one."""
+    """Return points (n, 3) and triangles (m, 3) of the surface in a file; coincident points are merged."""
     try:
         found = read_geometry(path)
     except GeometryFileError as error:
-        raise GeometryFileError(str(error) or "it is no mesh that can be read (STL, OBJ, PLY and VTU are)") from None
+        raise GeometryFileError(str(error) or "it is not a readable mesh (STL, OBJ, PLY and VTU are)") from None
     if not len(found.triangles):
         raise GeometryFileError("it holds no triangle")
     if not np.isfinite(found.vertices[np.unique(found.triangles)]).all():
         raise GeometryFileError("it holds a vertex that is not finite")
     vertices, which = np.unique(found.vertices, axis=0, return_inverse=True)
     triangles = which.reshape(-1)[found.triangles]
-    # By it some triangles become edges.
+    # Merging turns some triangles into edges.
     flat = (triangles == np.roll(triangles, 1, axis=1)).any(axis=1)
     used, triangles = np.unique(triangles[~flat], return_inverse=True)
     return vertices[used], triangles.reshape(-1, 3)
 
 
 def _closed(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return a surface with its triangles facing outwards, or raise what keeps it from being closed."""
+    """Return a surface with its triangles facing outwards; raise an error if it is not closed."""
     directed = np.concatenate([triangles[:, [k, (k + 1) % 3]] for k in range(3)])
     edges, which = np.unique(np.sort(directed, axis=1), axis=0, return_inverse=True)
     which = which.reshape(-1)
@@ -267,12 +267,12 @@ class Rotation(Table):
 
 
 class Mesh(Table, Solid):
-    """What a closed surface encloses, from a file; 3D only."""
+    """The interior of a closed surface from a file; 3D only."""
 
     file: str = Field(description="The file, relative to the scene: STL, OBJ, PLY, VTU, ...")
     scale: Positive = Field(1.0, description="Metres per unit of the file; 0.001 for millimetres.")
     rotate: Rotation | None = Field(None, description="Rotation, after scaling. Default: none.")
-    translate: Vector = Field(None, validate_default=True, description="What is added to all vertices in the end, m.")
+    translate: Vector = Field(None, validate_default=True, description="Translation, added to all vertices last, m.")
     _surface: ClosedSurface = PrivateAttr()
 
     @model_validator(mode="after")
@@ -308,7 +308,7 @@ class Mesh(Table, Solid):
 
 
 def leaving(mesh: Mesh, lower: np.ndarray, upper: np.ndarray) -> str:
-    """Say how a mesh leaves a domain by its size alone, and what would be right; "" where its place is at fault."""
+    """Return a message on a mesh larger than the domain, with a correction; "" if only its place is wrong."""
     size, room = np.ptp(mesh.bounds(), axis=0), upper - lower
     if np.all(size <= room):
         return ""
@@ -334,5 +334,5 @@ def moved_inside(mesh: Mesh, lower: np.ndarray, upper: np.ndarray) -> str:
 
 @lru_cache(maxsize=32)
 def _surface_of(path: Path, version: tuple[int, int], *placement: Any) -> ClosedSurface:
-    """Return the surface in a file; `version` tells versions of the file apart. Scenes that share it share one."""
+    """Return the surface in a file; `version` distinguishes versions of the file. The result is cached."""
     return ClosedSurface(*read_mesh(path, *placement))

@@ -1,7 +1,8 @@
-"""Points and triangles from a file, and a body in the form of points, each of which is a particle.
+"""Points and triangles from a file, and bodies given by points, each of which is a particle.
 
-By the ending of a file: CSV and NPY here, STL, OBJ and PLY by trimesh, and all others by PyVista. VTK ends the process
-where a binary PLY is cut off; trimesh raises. It refuses faces of different lengths in one, which meshio takes.
+The suffix selects the reader: CSV and NPY here; STL, OBJ and PLY by trimesh; all others by PyVista. VTK ends the
+process at a truncated binary PLY; trimesh raises. trimesh refuses a PLY with faces of different lengths; meshio reads
+it.
 """
 
 import csv
@@ -21,7 +22,7 @@ from mpmcli.scene.primitives import Solid
 from mpmcli.scene.problem import hint_at, listed, quoted
 from mpmcli.scene.quantity import AXES, Positive, Table, Vector, flaw, scene_dimension
 
-# The endings of files that trimesh reads.
+# Suffixes of files that trimesh reads.
 _BY_TRIMESH = (".obj", ".ply", ".stl")
 
 
@@ -36,7 +37,7 @@ class Geometry:
 
 
 class GeometryFileError(Exception):
-    """Why a file is of no use, in words that follow its name; empty where it cannot be read."""
+    """The fault of a file, in words that follow its name; empty if it cannot be read."""
 
 
 def scene_file(name: str, info: ValidationInfo) -> Path:
@@ -46,17 +47,17 @@ def scene_file(name: str, info: ValidationInfo) -> Path:
 
 
 def file_version(path: Path) -> tuple[int, int]:
-    """Return what tells versions of a file apart: when it was changed, ns, and its bytes; zeros where there is none."""
+    """Return the version of a file: time of its last change, ns, and size in bytes; zeros if it does not exist."""
     try:
         stat = path.stat()
-    # Of a name with a null character, ValueError.
+    # ValueError: a name with a null character.
     except (OSError, ValueError):
         return 0, 0
     return stat.st_mtime_ns, stat.st_size
 
 
 def absence(path: Path) -> str:
-    """Say why there is no file at a path, "" where there is one."""
+    """Return the reason why there is no file at a path, "" if there is one."""
     try:
         return "" if path.is_file() else "it is no file" if path.exists() else "there is no such file"
     # A name that is too long, or a directory that may not be read.
@@ -73,7 +74,7 @@ def read_geometry(path: Path) -> Geometry:
         with warnings.catch_warnings(), redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
             warnings.simplefilter("ignore")
             return _by_trimesh(path) if path.suffix.lower() in _BY_TRIMESH else _by_vtk(path)
-    # Of a damaged file readers raise almost anything; meshio even ends the process.
+    # Readers raise almost any exception at a damaged file; meshio even ends the process.
     except (Exception, SystemExit):
         raise GeometryFileError from None
 
@@ -105,7 +106,7 @@ def _by_trimesh(path: Path) -> Geometry:
 
 
 def _by_vtk(path: Path) -> Geometry:
-    """Return what PyVista reads, with the surface of solid cells."""
+    """Return the geometry that PyVista reads, with the surface of solid cells."""
     import pyvista as pv
     from vtkmodules.util.numpy_support import vtk_to_numpy
     from vtkmodules.vtkCommonCore import vtkLogger, vtkObject
@@ -149,11 +150,11 @@ TABLES = (".csv", ".npy")
 
 
 def read_points(path: Path, d: int, velocity: str | Sequence[str] | None) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return the points in a file, (n, d), and the velocities it is asked for, (n, d), or None; or a GeometryFileError.
+    """Return the points in a file, (n, d), and the requested velocities, (n, d), or None.
 
-    It is a CSV whose first line names the columns, x, y (and z) among them; an NPY of named columns, or of d or 2 d
-    unnamed ones, x, y, z, vx, vy, vz; or what `read_geometry` reads. `velocity` names the d columns of a table, or an
-    array of a file that PyVista reads.
+    The file is a CSV whose first line names the columns, x, y (and z) among them; an NPY of named columns, or of d or 2
+    d unnamed ones, x, y, z, vx, vy, vz; or a file that `read_geometry` reads. A GeometryFileError reports a fault.
+    `velocity` names the d columns of a table, or an array of a file that PyVista reads.
     """
     if fault := absence(path):
         raise GeometryFileError(fault)
@@ -206,7 +207,7 @@ def _csv(path: Path) -> dict[str, np.ndarray]:
             names = [name.strip() for name in next(rows, [])]
             lines = [(rows.line_num, row) for row in rows if row]
     except (UnicodeDecodeError, csv.Error, OSError):
-        raise GeometryFileError("it is no text with comma-separated values") from None
+        raise GeometryFileError("it is not text with comma-separated values") from None
     if not names or any(_is_number(name) for name in names):
         raise GeometryFileError("its first line must name the columns, such as x,y,z")
     for line, row in lines:
@@ -218,11 +219,11 @@ def _csv(path: Path) -> dict[str, np.ndarray]:
 
 def _npy(path: Path, d: int) -> dict[str, np.ndarray]:
     try:
-        # Mapped, so that a header cannot claim more than the file holds.
+        # Memory-mapped, so that a header cannot claim more than the file holds.
         found = np.load(path, mmap_mode="r", allow_pickle=False)
-    # Of a damaged header, Python's own tokenizer and parser raise almost anything.
+    # Python's tokenizer and parser raise almost any exception at a damaged header.
     except Exception:
-        raise GeometryFileError("it is no array of numpy") from None
+        raise GeometryFileError("it is not a numpy array") from None
     if found.dtype.names:
         return {name: found[name].reshape(-1).astype(np.float64) for name in found.dtype.names}
     if found.ndim != 2 or found.shape[1] not in (d, 2 * d) or found.dtype.kind not in "fiu":
@@ -236,7 +237,7 @@ def _data_set(path: Path, d: int, velocity: str | None) -> tuple[np.ndarray, np.
     try:
         found = read_geometry(path)
     except GeometryFileError:
-        raise GeometryFileError("it is no file of points that can be read (CSV, NPY, PLY and VTU are)") from None
+        raise GeometryFileError("it is not a readable file of points (CSV, NPY, PLY and VTU are)") from None
     if not len(found.points):
         raise GeometryFileError("it holds no point")
     position = _in_plane(found.points, d, "points")
@@ -252,7 +253,7 @@ def _data_set(path: Path, d: int, velocity: str | None) -> tuple[np.ndarray, np.
 
 
 def _in_plane(values: np.ndarray, d: int, what: str) -> np.ndarray:
-    """Return vectors (n, 3) of a 2D scene without their z, which has to be the same for all."""
+    """Return vectors (n, 3) of a 2D scene without their z, which must be the same for all."""
     if d < values.shape[1] and np.ptp(values[:, d]) > 0:
         raise GeometryFileError(f"its {what} lie in space, and the scene is 2D; give points of one z")
     return values[:, :d]
@@ -273,11 +274,11 @@ class Cloud:
 
 
 class Points(Table, Solid):
-    """Points from a file: the particles of the body as they are."""
+    """Points from a file, used as the particles of the body."""
 
     file: str = Field(description="The file, relative to the scene: CSV, NPY, PLY, VTU, ...")
     spacing: Positive | None = Field(
-        None, description="Distance between neighbours, m: a particle has its square or cube as volume."
+        None, description="Distance between neighbours, m; its square or cube is the volume of a particle."
     )
     total_volume: Positive | None = Field(
         None, description="Volume of the whole body, m^3 (m^2 in 2D), in place of spacing."
@@ -288,7 +289,9 @@ class Points(Table, Solid):
         "CSV and NPY, or the name of an array of VTU, VTP and VTK. Default: none.",
     )
     scale: Positive = Field(1.0, description="Metres per unit of the file; velocities are taken as they are.")
-    translate: Vector = Field(None, validate_default=True, description="What is added to all points after scaling, m.")
+    translate: Vector = Field(
+        None, validate_default=True, description="Translation, added to all points after scaling, m."
+    )
     _cloud: Cloud = PrivateAttr()
 
     @model_validator(mode="after")
@@ -301,7 +304,7 @@ class Points(Table, Solid):
         if (self.spacing is None) == (self.total_volume is None):
             places, hint = self._cloud.position, ""
             if len(places) > 1:
-                # Each from the nearest other one.
+                # Distance of each point from its nearest neighbour.
                 usual = float(np.median(self._cloud.tree.query(places[:10_000], k=2)[0][:, 1]))
                 hint = f"; its points are some {usual:.3g} m apart" if usual else ""
             raise flaw(f"needs either spacing or total_volume, which the mass of the body follows from{hint}")
@@ -324,7 +327,7 @@ class Points(Table, Solid):
 
     @property
     def edge(self) -> float:
-        """Edge of the square or cube that a particle stands for, m."""
+        """Edge of the square or cube of a particle, m."""
         n, d = self.position.shape
         return (self.volume / n) ** (1 / d)
 
@@ -332,12 +335,12 @@ class Points(Table, Solid):
         return self.position.min(axis=0), self.position.max(axis=0)
 
     def signed_distance(self, points: np.ndarray) -> np.ndarray:
-        """Return the distance of each point (n, d) from the particles, balls whose diameter is an edge, (n,), m."""
+        """Return the distance of each point (n, d) from the particles, as balls of diameter `edge`, (n,), m."""
         return self._cloud.tree.query(points)[0] - self.edge / 2
 
 
 @lru_cache(maxsize=32)
 def _cloud_of(path: Path, version: tuple[int, int], d: int, velocity: Any, scale: float, translate: Any) -> Cloud:
-    """Return the points in a file; `version` tells versions of the file apart."""
+    """Return the points in a file; `version` distinguishes versions of the file."""
     position, velocities = read_points(path, d, velocity)
     return Cloud(position * scale + np.array(translate), velocities)

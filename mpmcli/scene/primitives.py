@@ -1,4 +1,4 @@
-"""Forms given by numbers: which points lie inside, how far they reach, their exact volume and distance."""
+"""Forms given by numbers: inside test, bounding box, exact volume and signed distance."""
 
 import math
 from collections.abc import Sequence
@@ -11,13 +11,13 @@ from mpmcli.scene.quantity import AXES, Axis, Number, Positive, Table, Vector, f
 
 
 def unit(vector: Sequence[float]) -> np.ndarray:
-    """Return a vector of length 1 in the direction of one of any length but 0, however large or small, (d,)."""
+    """Return the unit vector of a nonzero vector of any length, however large or small, (d,)."""
     scaled = np.array(vector) / np.max(np.abs(vector))
     return scaled / np.linalg.norm(scaled)
 
 
 def grid_points(*axes: np.ndarray) -> np.ndarray:
-    """Return all points with coordinates from these axes, (n, d), the last axis fastest."""
+    """Return all points with coordinates from the given axes, (n, d), the last axis fastest."""
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
 
 
@@ -40,7 +40,7 @@ def _distance_to_edges(beyond: np.ndarray) -> np.ndarray:
 
 
 class Solid:
-    """What every form can say. In 2D a volume is an area, m^2: that of a slice one metre deep."""
+    """The interface of every form. In 2D a volume is an area, m^2: that of a slice one metre deep."""
 
     @property
     def volume(self) -> float:
@@ -52,7 +52,7 @@ class Solid:
         raise NotImplementedError
 
     def contains(self, points: np.ndarray, inset: float = 0.0) -> np.ndarray:
-        """Say of each point (n, d) whether it lies inside, at least `inset` metres from the surface."""
+        """Return whether each point (n, d) lies inside, at least `inset` metres from the surface, (n,)."""
         return self.signed_distance(points) <= -inset
 
     def signed_distance(self, points: np.ndarray) -> np.ndarray:
@@ -144,7 +144,7 @@ class Cylinder(Table, Solid):
         return _distance_to_edges(np.stack([np.maximum(-along, along - self.height), across - self.radius], axis=1))
 
     def _places(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return how far points (n, 3) are along the axis, from the base, and away from it, (n,) each, m."""
+        """Return the distances of points (n, 3) along the axis, from the base, and from the axis, (n,) each, m."""
         offset = points - np.array(self.base)
         along = offset @ self.direction
         return along, np.linalg.norm(offset - along[:, None] * self.direction, axis=1)
@@ -246,7 +246,7 @@ def _cross(u: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 
 def _fault_of_polygon(vertices: np.ndarray) -> str:
-    """Return what keeps vertices (n, 2) from making a simple polygon, or "" when nothing does."""
+    """Return why vertices (n, 2) do not form a simple polygon, or "" if they do."""
     n = len(vertices)
     vertices = vertices / max(1.0, np.max(np.abs(vertices)))  # so that no product overflows
     ahead = np.roll(vertices, -1, axis=0)

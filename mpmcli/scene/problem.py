@@ -1,4 +1,4 @@
-"""What is wrong with a scene, where, and what would be right: one problem per value, in sentences."""
+"""Problems of a scene: one sentence per faulty value, with its path and a correction."""
 
 import difflib
 from collections.abc import Iterator, Mapping
@@ -11,13 +11,13 @@ from pydantic import BaseModel, ValidationError
 from mpmcli.scene.material import MaterialParameters, knobs_of
 
 Path = tuple[str | int, ...]
-# Path in data that were changed on the way -> path in the scene as it was written.
+# Path in repaired data -> path in the scene as written.
 Renames = dict[Path, Path]
 
 
 @dataclass(frozen=True)
 class Problem:
-    """A fault of one value of a scene: its path, whose last key may be missing, and what would be right."""
+    """A fault of one value of a scene: its path, whose last key may be missing, and a sentence with a correction."""
 
     path: Path
     sentence: str
@@ -40,7 +40,7 @@ def nearest_entry(path: Path, entries: Mapping[Path, Any]) -> tuple[Any, Path] |
 
 
 def value_at(data: object, path: Path) -> object:
-    """Return the value that a path leads to in parsed TOML, or raise a LookupError."""
+    """Return the value at a path in parsed TOML, or raise a LookupError."""
     for part in path:
         if (isinstance(data, dict) and part in data) or (
             isinstance(data, list) and isinstance(part, int) and part < len(data)
@@ -87,7 +87,7 @@ def nearest(word: str, known: list[str]) -> str | None:
 
 
 def hint_at(word: str, known: list[str], otherwise: str) -> str:
-    """Return a question for the word that a misspelled one most likely means, or what to say where there is none."""
+    """Return a question with the likely meaning of a misspelled word, or `otherwise` if there is none."""
     return f'did you mean "{guess}"?' if (guess := nearest(word, known)) else otherwise
 
 
@@ -114,7 +114,7 @@ def known_keys(model: type[BaseModel], loc: Path) -> list[str]:
 
 
 def written(value: object) -> str:
-    """Write a value as it would stand in a scene, cut after 60 characters."""
+    """Write a value as in a scene, cut after 60 characters."""
     match value:
         case bool():
             text = str(value).lower()
@@ -134,7 +134,7 @@ def written(value: object) -> str:
 
 
 def path_in(data: object, loc: Path, missing: bool = False) -> Path:
-    """Return pydantic's location without the names of union members; `missing` where its last key is not there."""
+    """Return pydantic's location without the names of union members; `missing` if its last key is absent."""
     path: Path = ()
     for position, part in enumerate(loc):
         try:
@@ -190,7 +190,7 @@ def _missing_key(loc: Path, model: type[BaseModel]) -> str:
 
 
 def _wrong_value(errors: list[Any], value: object) -> str:
-    """Join what the members of a union would have taken, for example `a number or "auto"`."""
+    """Join the values that the members of a union accept, for example `a number or "auto"`."""
     right: list[str] = []
     choices: list[str] = []
     for one in errors:
@@ -222,7 +222,7 @@ def _tables_at(model: type[BaseModel], loc: Path) -> list[type[BaseModel]]:
             if part in table.model_fields
             for inner in _models_in(table.model_fields[part].annotation)
         ]
-        # A part that is no key is the tag of a union, and chooses among its members.
+        # A part that is not a key is the tag of a union and selects one of its members.
         tagged = [t for t in tables if "law" in t.model_fields and t.model_fields["law"].default == part]
         tables = deeper or tagged
     return tables

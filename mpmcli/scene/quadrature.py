@@ -1,4 +1,4 @@
-"""Integrals and extremes of what depends on time alone, which miss no pulse, however short it is.
+"""Integrals and extremes of functions of time alone; they miss no pulse, however short.
 
 An interval of time is halved until the bounds of interval arithmetic agree with samples: a pulse between two samples
 shows in the bounds.
@@ -13,21 +13,22 @@ import numpy as np
 
 from mpmcli.scene.expression import Tree, bounds_of, evaluate
 
-# Nodes and weights of Gauss and Legendre's rule on (-1, 1).
+# Nodes and weights of the Gauss-Legendre rule on (-1, 1).
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)
-# A part is fine where the bounds are no wider than this many times the range of the samples (an expression in which
-# time occurs once has 1, and samples miss a tenth of it), or where all that they leave open is this share of the whole:
+# A part is resolved if its bounds are at most this many times as wide as the range of its samples (an expression in
+# which time occurs once has 1, and samples miss a tenth of it), or if the undecided rest is this fraction of the whole:
 # of an integral, and of a search.
 RATIO, OPEN, SEEN = 16.0, 1e-13, 1e-7
-# And where the rule of its halves differs from its own by no more than this share of the whole.
+# Also required: the rule of its halves differs from its own by at most this fraction of the whole.
 AGREEMENT = 1e-13
-# The first parts, and where a part is cut in two: uneven, as a rule agrees with that of even halves by chance where
-# a jump lies in the middle.
+# Number of initial parts, and position at which a part is split: off centre, because with a jump in the middle the rule
+# agrees with that of even halves by chance.
 FIRST, CUT = np.array([0.0, 0.23, 0.48, 0.77, 1.0]), 0.46
-# Halvings at most: the edge of a pulse is found to rounding. Parts at most, after which the samples must do.
+# Largest number of halvings, which finds the edge of a pulse to rounding; largest number of parts, beyond which samples
+# are used as they are.
 DEPTH, MOST_PARTS = 60, 2048
-# Windows that a step spans at most, windows kept, and their usual width, s: narrower where frames are closer than a
-# quarter of that, and wider where a step, which is no longer than a frame, could span more than WINDOWS.
+# Largest number of windows that a step spans, number of windows kept, and their usual width, s: narrower if frames are
+# closer than a quarter of that, wider if a step, at most as long as a frame, could span more than WINDOWS.
 WINDOWS, KEPT, LONG = 128, 8, 2.0**-4
 
 
@@ -45,9 +46,9 @@ class Parts:
 
 @np.errstate(all="ignore")
 def parts_of(tree: Tree, start: float, end: float, *, precise: bool = True) -> Parts:
-    """Subdivide the time from `start` to `end` (s) so that every part of a tree of t is resolved; a truth is 1 or 0.
+    """Subdivide `start` to `end` (s) so that a tree of t is resolved in every part; a truth value is 1 or 0.
 
-    If `precise`, the parts suit an integral; otherwise every feature is found and no more.
+    If `precise`, the parts suit an integral; otherwise they only locate every feature.
     """
     edges = start + (end - start) * FIRST
     low, high = edges[:-1], edges[1:]
@@ -55,7 +56,7 @@ def parts_of(tree: Tree, start: float, end: float, *, precise: bool = True) -> P
     count, whole = 0, 0.0
     for depth in range(DEPTH):
         middle = low + CUT * (high - low)
-        # Of each part, and of its halves.
+        # Integrals of each part, and of its halves.
         values, first, second = _values(tree, (low, low, middle), (high, middle, high))
         least, most = (np.broadcast_to(side, low.shape) for side in bounds_of(tree, {"t": (low, high)}))
         width = np.where(np.isfinite(most - least), most - least, np.inf)
@@ -86,7 +87,7 @@ ANTIDERIVATIVES[:, 0] = -(ANTIDERIVATIVES * (-1.0) ** np.arange(len(NODES) + 1))
 
 
 # Columns of the rows of a window: start, middle and half length of a part, s; a bound on |value| in it; coefficients of
-# the integral from the start of the window in powers of the place within the part, -1 to 1, the highest first.
+# the integral from the start of the window in powers of the position in the part, -1 to 1, the highest first.
 LOW, MIDDLE, HALF, BOUND, COEFFICIENTS = range(5)
 COLUMNS = COEFFICIENTS + len(NODES) + 1
 
@@ -120,8 +121,8 @@ class Mean:
     """Means of a tree of t over intervals of a run.
 
     The run is divided into windows, each of which is subdivided once, so that a mean costs some microseconds. It does
-    not depend on what was asked for before, nor on the end of the run: windows follow the time between frames, which
-    stays where a run goes on for longer, up to rounding. Their width is a power of two.
+    not depend on earlier calls, nor on the end of the run: the width of windows follows from the time between frames,
+    which an extended run keeps up to rounding, and is a power of two.
     """
 
     def __init__(self, tree: Tree, pause: float, end: float) -> None:
@@ -153,7 +154,7 @@ class Mean:
         return k * self._width
 
     def rows(self, k: int) -> np.ndarray:
-        """Return what a window consists of, (n, COLUMNS)."""
+        """Return the rows of a window, (n, COLUMNS)."""
         return self._window(k).rows
 
     def _window(self, k: int) -> _Window:
@@ -163,7 +164,7 @@ class Mean:
             start, end = self.start_of(k), self.start_of(k + 1)
             window = _Window(self._tree, start, end)
             if start < self._end < end and not np.isfinite(window.rows).all():
-                # What has no value after the end, as the root of the time that is left.
+                # Values may not exist after the end, for example the root of the remaining time.
                 window = _Window(self._tree, start, self._end)
             self._kept[k] = window
         return self._kept[k]
@@ -178,7 +179,7 @@ def integral_of(tree: Tree, start: float, end: float) -> float:
 
 
 def largest_of(tree: Tree, start: float, end: float) -> float:
-    """Return a bound on |value| of a tree of t between two times, s; of the samples where bounds are not known."""
+    """Return a bound on |value| of a tree of t between two times, s; the largest sample if bounds are unknown."""
     low, high = bounds_of(tree, {"t": (np.float64(start), np.float64(max(start, end)))})
     largest = float(max(-low, high))
     if math.isfinite(largest):

@@ -1,4 +1,4 @@
-"""The kinds of values that a scene is made of: numbers, counts, and vectors as long as the scene has axes."""
+"""Types of the values of a scene: numbers, counts, and vectors with one entry per axis."""
 
 from collections.abc import Iterable
 from typing import Annotated, Any
@@ -8,7 +8,7 @@ from pydantic_core import PydanticCustomError
 
 NUMBER_WORDS = {2: "two", 3: "three"}
 AXES = "xyz"
-# What names of bodies, colliders and so on look like.
+# Pattern of names of bodies, colliders and so on.
 NAME = r"^[^\W\d_][\w -]*$"
 LARGEST = 1e15
 
@@ -56,7 +56,7 @@ def _as_long_as_the_scene(value: tuple, info: ValidationInfo) -> tuple:
 
 
 def _not_enormous(value: float) -> float:
-    """Refuse numbers whose powers leave the range of floating point; no scene in SI units needs them."""
+    """Refuse numbers whose powers overflow or underflow; no scene in SI units needs them."""
     if abs(value) > LARGEST:
         raise flaw(f"is beyond what can be computed with, {LARGEST:g} at most; found {value:g}")
     return value
@@ -100,5 +100,5 @@ def direction_as(example: str) -> Any:
     return Annotated[Vector, AfterValidator(check)]
 
 
-# Of an axis in 3D.
+# Direction of an axis in 3D.
 Axis = direction_as("[0, 0, 1] has")

@@ -1,4 +1,4 @@
-"""Relaxed samples: particles moved a little, until nodes of the grid have the volume and the centre of a full cell."""
+"""Relaxed samples: particles moved slightly until grid nodes have the volume and the centre of a full cell."""
 
 from collections.abc import Iterator
 from functools import reduce
@@ -9,18 +9,18 @@ import numpy as np
 from mpmcli.scene.domain import PERIODIC, Domain
 from mpmcli.scene.shapes import Form
 
-# Descents in 2D and 3D, the part of a Newton step that each of them takes, and the part of the one before that it goes
-# on with. Steps above 0.65 swing at the edges of walls in 3D.
+# Descent steps in 2D and 3D, the fraction of a Newton step in each, and the fraction of the previous step that is added
+# (momentum). Steps above 0.65 oscillate at the edges of walls in 3D.
 _DESCENTS, _STEP, _MOMENTUM = {2: 24, 3: 13}, 0.5, 0.7
 # Integrals over space of |grad w|^2 and |grad (w r)|^2, w the spline of a node and r the distance along one axis.
 _CURVATURES = {2: (1.1, 0.3243), 3: (0.9075, 0.2206)}
-# Deviation of a node that is small enough; and the farthest that a descent moves a particle along an axis, of the edge
-# of what it stands for.
+# Tolerated deviation of a node; and the largest move of a particle along an axis per step, as a fraction of the edge of
+# its square or cube.
 _ENOUGH, _FARTHEST = 1e-3, 0.1
-# Cells that are round-off, and the reach of a spline less that.
+# Round-off in cells, and the reach of a spline less that.
 _SLACK = 1e-4
 _REACH = 1.5 - _SLACK
-# Particles that are looked at together, so that what is computed of them stays in the cache.
+# Particles per batch, so that intermediate values stay in the cache.
 _AT_ONCE = 2**16
 # The spline w of the node before the nearest one, of that one and of the next, and w r, r the distance from the node:
 # coefficients of the powers 0 to 3 of the distance t from the nearest one.
@@ -38,11 +38,11 @@ _SPLINES = {d: _products(d) for d in (2, 3)}
 
 
 def relaxed(position: np.ndarray, volume: float, form: Form, domain: Domain) -> np.ndarray:
-    """Return particles of a form, (n, d), m, moved such that full nodes have the volume h^d, and no first moment.
+    """Return particles of a form, (n, d), m, moved so that full nodes have the volume h^d and no first moment.
 
-    Full are nodes whose quadratic splines the form fills, with its images behind walls and beyond periodic faces.
-    Descent with momentum on the squares of what they lack: particles go along the gradient of a field of splines, those
-    alone that reach a node which lacks anything. None leaves the form.
+    A node is full if the form, with its images behind walls and beyond periodic faces, fills its quadratic spline. The
+    method is gradient descent with momentum on the squared deficits of full nodes. Only particles within reach of a
+    node with a deficit move, and none leaves the form.
 
     Args:
         position: (n, d) float64, m.
@@ -64,7 +64,7 @@ def relaxed(position: np.ndarray, volume: float, form: Form, domain: Domain) -> 
         return position
     found, moving = position.copy(), position[order]
     rest = sums - nodes.sums(moving, share)
-    # A Newton step of one node alone; those on walls respond twice as much for each, as they meet images as well.
+    # A Newton step of a single node; nodes on walls respond twice as strongly for each wall, because of the images.
     weights = _STEP * weights / np.reshape([_CURVATURES[d][min(e, 1)] for e in range(1 + d)], (1 + d,) + (1,) * d)
     lower, upper = np.clip(bounds, domain.origin, domain.upper)
     most, steps = _FARTHEST * share ** (1 / d), np.zeros(moving.shape)
@@ -112,12 +112,12 @@ class _Nodes:
                 if is_wall:
                     pairs.append(([wall, wall + ahead], [wall, wall - ahead], odd))
             for front, behind, sign in pairs:
-                # From a wall far away there is nothing to fold.
+                # A distant wall has nothing to fold.
                 if min(front + behind) >= 0 and max(front + behind) < self.counts[a]:
                     yield a, front, behind, sign
 
     def folded(self, field: np.ndarray, *, back: bool = False) -> np.ndarray:
-        """Add what lies beyond faces to the nodes that it is an image of, in place; `back` is the transpose."""
+        """Add image nodes beyond faces to their nodes in the domain, in place; `back` is the transpose."""
         for a, front, behind, sign in reversed(self.folds) if back else self.folds:
             along = np.moveaxis(field, 1 + a, 0)
             onto, beyond = (behind, front) if back else (front, behind)
@@ -126,12 +126,12 @@ class _Nodes:
 
     def weights(self, form: Form, sums: np.ndarray) -> np.ndarray:
         """Return 1 for full nodes, halved for each wall that they lie on, and 0 for others, (*counts)."""
-        # Where less than half of the volume is, a hole was missed that is smaller than the distance of the points.
+        # Less than half of the volume means that the test points missed a hole smaller than their distance.
         some = np.flatnonzero(sums[0] > 0.5)
         places = np.stack(np.unravel_index(some, self.counts), axis=1) + self.first
         full = np.all((places >= 0) & (places <= self.cells - self.periodic), axis=1)
         for offset in product((-_REACH, 0.0, _REACH), repeat=len(self.counts)):
-            # Of what lies behind a wall there is an image if the form reaches as far as the wall.
+            # Nodes behind a wall have an image if the form reaches the wall.
             points = np.clip(places[full] + np.array(offset), *self.reach)
             points = np.where(self.periodic, points % self.cells, points)
             full[full] = form.contains(self.origin + self.h * points)
@@ -141,7 +141,7 @@ class _Nodes:
         return found
 
     def lack(self, sums: np.ndarray) -> np.ndarray:
-        """Return what a field of sums lacks to that of full cells."""
+        """Return the difference between the field of full cells and a field of sums."""
         found = -sums
         found[0] += 1.0
         return found
@@ -178,7 +178,7 @@ class _Nodes:
         return np.stack(_polynomial(powers.reshape(*(4,) * len(distances), -1), index, distances)[1:], axis=1)
 
     def _around(self, field: np.ndarray, low: int, n: int) -> list[np.ndarray]:
-        """Return the parts of a field, (1 + d, nodes), that lie about n nodes from one on, in the order of _SPLINES."""
+        """Return the slices of a field, (1 + d, nodes), around n nodes from `low` on, in the order of _SPLINES."""
         offsets = [int(np.dot(offset, self.strides)) for offset in product((-1, 0, 1), repeat=len(self.counts))]
         return [values[low + offset : low + offset + n] for values in field for offset in offsets]
 

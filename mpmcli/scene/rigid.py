@@ -1,4 +1,4 @@
-"""Rigid bodies: colliders with a density, whose motion follows from what pushes them."""
+"""Rigid bodies: colliders with a density, whose motion follows from the forces on them."""
 
 import math
 from dataclasses import dataclass
@@ -36,7 +36,7 @@ class Moments:
 def moments_of(form: Form, density: float | None, mass: float | None) -> Moments:
     """Return the moments of a form with a density, kg/m^3, or else a mass, kg.
 
-    They are sums over cells, of which those at the surface are filled in part.
+    They are sums over cells; cells at the surface count in part.
     """
     lower, upper = (np.array(corner, float) for corner in form.bounds())
     d = len(lower)
@@ -61,13 +61,13 @@ def _has_direction(axis: Any, info: ValidationInfo) -> Any:
     return axis
 
 
-# Of what turns; None in 2D.
+# Axis of rotation; None in 2D.
 SpinAxis = Annotated[tuple[Number, Number, Number] | None, BeforeValidator(_has_direction)]
 Z = (0.0, 0.0, 1.0)
 
 
 class _Joint(Table):
-    """What leaves a rigid body one way to move, along which a motor may drive it."""
+    """A joint that leaves a rigid body one degree of freedom, which a motor may drive."""
 
     motor: OfTime | None = Field(
         None, description="Rate that a motor keeps, rad/s or m/s: a number, or an expression of t. Default: no motor."
@@ -84,7 +84,7 @@ class _Joint(Table):
 
 
 class Hinge(_Joint):
-    """A hinge, about whose axis a rigid body turns."""
+    """A hinge: a rigid body rotates about its axis."""
 
     type: Literal["hinge"]
     point: Vector | None = Field(None, description="Point of the axis, m. Default: the centre of mass.")
@@ -98,7 +98,7 @@ class Hinge(_Joint):
 
 
 class Slider(_Joint):
-    """A slider, along which a rigid body moves without turning."""
+    """A slider: a rigid body moves along it without rotation."""
 
     type: Literal["slider"]
     axis: direction_as("[0, 1] has in 2D") = Field(description="Direction to move along, of any length.")
@@ -109,12 +109,12 @@ class Slider(_Joint):
 
 
 Joint = Annotated[Hinge | Slider, Field(discriminator="type")]
-# What of a motion may be fixed.
+# Parts of a motion that may be fixed.
 Fixed = Literal["x", "y", "z", "rotation"]
 
 
 def ways_of(dimension: int, fixed: tuple[str, ...]) -> np.ndarray:
-    """Return in columns the velocities and spins of a body of which some are fixed, at a rate of 1 each."""
+    """Return the velocity and spin at unit rate of each degree of freedom that is not fixed, in columns."""
     turns = 2 * dimension - 3
     left = [a for a in range(dimension) if AXES[a] not in fixed]
     left += [] if "rotation" in fixed else range(dimension, dimension + turns)
@@ -134,24 +134,24 @@ def turned_by(rotation: np.ndarray) -> np.ndarray:
 
 
 class Posed:
-    """What has a pivot, (d,), m, and at each time a pose: where the pivot is, and a rotation."""
+    """A motion with a pivot, (d,), m, and at each time a pose: the position of the pivot, and a rotation."""
 
     def placed(self, points: np.ndarray, time: float) -> np.ndarray:
-        """Return where points (n, d) that start at these places are at a time, s; the start is that without offset."""
+        """Return the positions at a time, s, of points (n, d) given at the start, without offset."""
         place, turned = self.pose(time)
         return place + (points - np.array(self.pivot)) @ turned.T
 
     def taken_back(self, points: np.ndarray, time: float) -> np.ndarray:
-        """Undo `placed`: where points (n, d) would have to start."""
+        """Inverse of `placed`: return the start of points (n, d)."""
         place, turned = self.pose(time)
         return np.array(self.pivot) + (points - place) @ turned
 
 
 @dataclass(frozen=True, eq=False)
 class Path(Posed):
-    """The motion of a rigid body as far as it is known, in place of a `Motion`: its pose at the times of some frames.
+    """The computed motion of a rigid body, in place of a `Motion`: its pose at the times of some frames.
 
-    Between them it is that of the nearest frame.
+    Between frames the pose is that of the nearest frame.
     """
 
     pivot: tuple[float, ...]  # its centre at the start, (d,), m

@@ -1,4 +1,4 @@
-"""Particles of bodies: where they start, how they move and are deformed, and how much volume and mass each has."""
+"""Particles of bodies: initial position, velocity and deformation, volume and mass."""
 
 import math
 from collections.abc import Iterator
@@ -19,33 +19,32 @@ from mpmcli.scene.relaxation import relaxed
 from mpmcli.scene.schema import Body, Scene
 from mpmcli.scene.sheets import sheets_of
 
-# Points per radius^d of a sample, as measured, in 2D and 3D. Without end it would be 0.6965 and 0.7334.
+# Points per radius^d of a sample, as measured, in 2D and 3D. Sampling to saturation would give 0.6965 and 0.7334.
 DENSITY = {2: 0.680, 3: 0.652}
-# Cells per radius along an axis, rounds in which some of those with room offer a point, and points per radius^d that
-# are offered in each.
+# Cells per radius along an axis, number of rounds of dart throwing, and candidate points per radius^d in each round.
 _FINE, _ROUNDS, _OFFERED = {2: 6, 3: 4}, 14, 1.0
-# Radii by which the box is enlarged: points at an edge lie more closely, as nothing competes with them beyond it.
+# Radii by which the box is enlarged: points are denser at an edge, which has no competing points beyond it.
 _MARGIN = 3
 _PLACES_AT_ONCE = 2_000
 
 
 def disk_radius(spacing: float, d: int) -> float:
-    """Return the radius at which a sample has as many points as a lattice of this spacing, m."""
+    """Return the radius, m, at which a sample has as many points as a lattice of the given spacing, m."""
     return DENSITY[d] ** (1 / d) * spacing
 
 
 def poisson_disk(lower: np.ndarray, upper: np.ndarray, radius: float, generator: np.random.Generator) -> np.ndarray:
     """Return points in a box with corners (d,), at least `radius` apart, and nearly everywhere within it of each other.
 
-    Dart throwing in cells that have room, after Ebeida et al. (2012): in each round some cells offer a point, those too
-    close to a point that is there or to one offered before it are refused, and cells that a point covers are dropped.
-    The same generator always gives the same points, (n, d), m; about DENSITY[d] per radius^d.
+    Dart throwing in cells that have room, after Ebeida et al. (2012): in each round some cells propose a point, points
+    too close to an accepted or an earlier proposed one are refused, and covered cells are dropped. The same generator
+    always gives the same points, (n, d), m; about DENSITY[d] per radius^d.
     """
     from scipy.spatial import KDTree
 
     d = len(lower)
     width = radius / _FINE[d]
-    # Beyond the margin there are cells that points cover, and that offer none.
+    # Cells beyond the margin can be covered but propose no points.
     pad = _FINE[d] + 1
     start = lower - _MARGIN * radius - pad * width
     counts = np.ceil((upper + _MARGIN * radius - start) / width).astype(int) + pad
@@ -103,17 +102,17 @@ def first_come(pairs: np.ndarray, n: int) -> np.ndarray:
 
 
 def has_expressions(body: Body) -> bool:
-    """Say whether anything that a body starts with depends on the place."""
+    """Return whether any initial value of a body depends on the position."""
     return moves_unevenly(body) or body.deformation is not None
 
 
 def moves_unevenly(body: Body) -> bool:
-    """Say whether the velocity of a body, or its gradient, is an expression."""
+    """Return whether the velocity of a body, or its gradient, is an expression."""
     return varies(*body.velocity) or replaces_gradient(body)
 
 
 def replaces_gradient(body: Body) -> bool:
-    """Say whether velocity_gradient is the affine velocity C itself, and adds nothing to the velocity."""
+    """Return whether velocity_gradient is the affine velocity C itself and adds nothing to the velocity."""
     return varies(*(entry for _, entry in entries_in(body.velocity_gradient)))
 
 
@@ -160,8 +159,8 @@ def initial_deformation(body: Body, position: np.ndarray, domain: Domain) -> np.
 def hydrostatic_load(body: Body, position: np.ndarray, domain: Domain) -> np.ndarray:
     """Return density g depth, (n,), Pa, the depth below the top of the bounding box of the body, against gravity.
 
-    Particles start evenly spaced, with the mass that their spacing has at rest, and act with J p times their volume at
-    rest: it is J p that has to carry their weight.
+    Particles start evenly spaced, with the mass of their volume at rest, and their force is J p times that volume:
+    therefore J p must carry their weight.
     """
     gravity = domain.gravity_at(0.0)
     lower, upper = body.shape.form.bounds()
@@ -170,7 +169,7 @@ def hydrostatic_load(body: Body, position: np.ndarray, domain: Domain) -> np.nda
 
 
 def initial_faults(body: Body, position: np.ndarray, domain: Domain) -> Iterator[tuple[Path, str]]:
-    """Yield the keys of a body whose values are not usable at some place, each with a sentence on the first place."""
+    """Yield each key of a body with an invalid value at some position, and a sentence on the first such position."""
     d = position.shape[1]
     for c, entry in enumerate(body.velocity):
         yield from _not_finite(("velocity", c), entry, position)
@@ -189,7 +188,7 @@ def initial_faults(body: Body, position: np.ndarray, domain: Domain) -> Iterator
         load = hydrostatic_load(body, position, domain)
         where = _first(~np.isfinite(body.material.volume_ratio_under(load)), position)
         if where:
-            said = f"asks for {load.max():.4g} Pa, more than the material can press with; give it a larger bulk_modulus"
+            said = f"requires {load.max():.4g} Pa, more than the material can bear; give it a larger bulk_modulus"
             yield ("initial_pressure",), said
 
 
@@ -240,13 +239,13 @@ def _not_finite(key: Path, entry: Entry, position: np.ndarray) -> Iterator[tuple
 
 
 def _first(wrong: np.ndarray, position: np.ndarray) -> str:
-    """Return the place of the first particle that is wrong, "" where none is."""
+    """Return the position of the first faulty particle, "" if there is none."""
     return f"at {place_text(position[np.argmax(wrong)])}" if wrong.any() else ""
 
 
-# Lattice points that are looked at together; bounds the memory that sampling needs beyond its result.
+# Lattice points per batch; bounds the memory that sampling needs beyond its result.
 _POINTS_AT_ONCE = 2**16
-# Particles of which a body with random ones gets some.
+# Expected number of random particles from which on a body certainly gets one.
 _SURE = 100
 # Particles that are counted in no time, and those of a Poisson sample, which takes 0.02 to 0.1 ms for each.
 MOST_COUNTED, MOST_POISSON = 200_000, 10_000
@@ -261,11 +260,11 @@ class BodyParticles:
         position: (n, d) float64, m, in the coordinates of the scene.
         velocity: (n, d) float64, m/s; one read-only row where all have the same.
         affine: (n, d, d) float64, initial velocity gradient, 1/s; one read-only matrix where all have the same.
-        volume: of each particle, m^3 (m^2 in 2D): that of the shape divided by n.
-        mass: of each particle, kg (kg per metre of depth in 2D).
+        volume: volume of each particle, m^3 (m^2 in 2D): that of the shape divided by n.
+        mass: mass of each particle, kg (kg per metre of depth in 2D).
         deformation: J, (n,), or F, (n, d, d), at the start; None where there is none.
-        initial: (n, d), the X of expressions, m, where that is not the position.
-        waits: whether they belong to an emitter, and come later.
+        initial: (n, d), the X of expressions, m, if it differs from the position.
+        waits: whether they belong to an emitter and enter later.
     """
 
     name: str
@@ -285,16 +284,16 @@ class BodyParticles:
 
 
 def sample_bodies(scene: Scene) -> list[BodyParticles]:
-    """Fill every body of a scene with particles, and then every emitter; they are always the same for a scene.
+    """Fill every body of a scene with particles, and then every emitter; the result is deterministic.
 
     Memory is proportional to `estimate_particles`, which callers check first.
 
     Raises:
-        InputError: a body is too thin for its lattice and gets no particle, or what it starts with is not finite there.
+        InputError: a body is too thin for its lattice and gets no particle, or an initial value is not finite.
     """
     found = [_sample(body, index, scene.domain) for index, body in enumerate(scene.bodies)]
     for emitter in scene.emitters:
-        # Sheet after sheet, at the places where they will enter.
+        # Sheet after sheet, at the positions at which they enter.
         sheets = sheets_of(emitter, scene)
         position = sheets.places(emitter)
         n, d = position.shape
@@ -305,7 +304,7 @@ def sample_bodies(scene: Scene) -> list[BodyParticles]:
 
 
 def estimate_particles(scene: Scene) -> int:
-    """Return how many particles the scene has, from volumes alone: exact for boxes with a lattice, else close."""
+    """Return the number of particles of a scene from volumes alone: exact for boxes with a lattice, else close."""
     bodies = sum(estimate_body(body, scene.domain.spacing) for body in scene.bodies)
     return bodies + sum(sheets_of(emitter, scene).particles for emitter in scene.emitters)
 
@@ -341,7 +340,7 @@ def lattice_spacing(body: Body, h: float) -> float:
 
 
 def points_per_cell(body: Body, h: float) -> int:
-    """Return the particles per cell of a body: what it says, or that of its points, at least 1."""
+    """Return the particles per cell of a body: the given number, or that of its points, at least 1."""
     form = body.shape.form
     return max(1, round((h / form.edge) ** len(body.velocity))) if isinstance(form, Points) else body.particles_per_cell
 
@@ -356,20 +355,21 @@ def lattice_points(body: Body, h: float) -> int:
 def _lattice_counts(body: Body, h: float) -> list[int]:
     """Return the number of lattice points along each axis.
 
-    That of a box is stretched to fit it; another one keeps its spacing, is centred on the bounding box, and covers it.
+    The lattice of a box is stretched to fit it; any other keeps its spacing, is centred on the bounding box, and covers
+    it.
     """
     lower, upper = body.shape.form.bounds()
     ratios = ((upper - lower) / lattice_spacing(body, h)).tolist()
     if isinstance(body.shape.form, Box):
         return [max(1, round(r)) for r in ratios]
-    # A bounding box of a whole number of spacings, up to round-off, needs no point more.
+    # A bounding box of a whole number of spacings, up to round-off, needs no additional point.
     return [max(1, math.ceil(r - 1e-9)) for r in ratios]
 
 
 def particle_places(body: Body, index: int, h: float) -> np.ndarray:
-    """Return where the particles of a body start, (n, d), m, from its index in the scene and the grid spacing h.
+    """Return the initial positions of a body's particles, (n, d), m, from its scene index and the grid spacing h.
 
-    Those of a relaxed body are moved a little from there.
+    The particles of a relaxed body are then moved slightly.
     """
     form = body.shape.form
     if isinstance(form, Points):
@@ -401,7 +401,7 @@ def _sample(body: Body, index: int, domain: Domain) -> BodyParticles:
     volume = form.volume / len(position)
     if body.relaxed:
         position = relaxed(position, volume, form, domain)
-    # A body too large to be looked at when the scene was loaded.
+    # A body too large to be examined when the scene was loaded.
     faults = [f"{path_text(('bodies', index, *key))}: {said}" for key, said in initial_faults(body, position, domain)]
     if faults:
         raise InputError("\n".join(faults))
@@ -417,11 +417,11 @@ def _generator(body: Body, index: int) -> np.random.Generator:
 
 
 def holds_particles(body: Body, index: int, h: float) -> bool:
-    """Say whether a body, of the given index in its scene, gets any particle at grid spacing h."""
+    """Return whether a body, of the given index in its scene, gets any particle at grid spacing h."""
     if isinstance(body.shape.form, Points):
         return True
     if body.sampling == "poisson":
-        # Points at random miss no body that holds as many of them, however thin.
+        # Random points miss no body with this expected number of them, however thin.
         return estimate_body(body, h) > _SURE or len(particle_places(body, index, h)) > 0
     if body.sampling == "turned":
         return len(_turned(body, h)) > 0
@@ -438,7 +438,7 @@ def no_particles(body: Body, h: float) -> str:
 def _lattice(body: Body, index: int, h: float) -> Iterator[np.ndarray]:
     """Yield the points (k, d) of the body's lattice in order, a bounded number at a time.
 
-    A jittered body has one point at random in each cell of the lattice instead of one at its centre.
+    A jittered body has one random point in each cell of the lattice instead of the centre.
     """
     lower, upper = body.shape.form.bounds()
     counts = np.array(_lattice_counts(body, h))
@@ -475,7 +475,7 @@ def turned_points(half: np.ndarray, offset: float = 0.5) -> np.ndarray:
     """Return the points of R (Z^d + offset) that are no farther than `half`, (d,), from 0 along each axis, (n, d)."""
     axes = turned_axes(len(half))
     reach = np.ceil(np.abs(axes.T) @ half).astype(int) + 1
-    # Lines along the last axis of the lattice: the numbers of the first and the last point of each in the box.
+    # Lines along the last axis of the lattice: the indices of the first and the last point of each in the box.
     starts = np.meshgrid(*[np.arange(-r, r) + offset for r in reach[:-1]], indexing="ij")
     lines = np.stack(starts, axis=-1).reshape(-1, len(half) - 1) @ axes[:, :-1].T
     middle, span = -lines / axes[:, -1], half / np.abs(axes[:, -1])
@@ -490,10 +490,10 @@ def turned_points(half: np.ndarray, offset: float = 0.5) -> np.ndarray:
 def turned_box(lower: np.ndarray, upper: np.ndarray, counts: np.ndarray) -> np.ndarray:
     """Return as many points of a turned lattice in a box, (n, d), m, as a lattice of `counts` points per axis has.
 
-    The lattice is stretched as that one is, and then a little more, such that the box holds just these.
+    The lattice is stretched as that one is, and then slightly more, until the box contains exactly that number.
     """
     half, n = counts / 2, math.prod(counts.tolist())
-    # About a point the lattice has odd numbers of points, about the middle of a cell even ones.
+    # A box centred on a lattice point contains an odd number of points; one centred on a cell, an even number.
     points = turned_points(half + 1, offset=0.0 if n % 2 else 0.5)
     reach = np.max(np.abs(points) / half, axis=1)
     chosen = np.argsort(reach, kind="stable")[: n + 1]

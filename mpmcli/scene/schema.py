@@ -1,4 +1,4 @@
-"""What a scene may say: one frozen model per table, each key with its unit, range and default."""
+"""The tables of a scene: one frozen model per table, each key with its unit, range and default."""
 
 from functools import lru_cache
 from typing import Annotated, Any, ClassVar, Literal, Union, get_args
@@ -32,7 +32,7 @@ def _filled_lattice(value: object, info: ValidationInfo) -> object:
 
 
 def _whole_lattice(count: int, info: ValidationInfo) -> int:
-    """Refuse a lattice whose number of particles per cell is no square (2D) or cube (3D)."""
+    """Refuse a lattice whose number of particles per cell is not a square (2D) or cube (3D)."""
     dimension = scene_dimension(info)
     shape = info.data.get("shape")
     of_points = shape is not None and getattr(shape, "points", None)
@@ -69,10 +69,10 @@ Material = Annotated[
 
 
 class Emitter(Table):
-    """A mouth that material flows out of at a steady velocity.
+    """A mouth from which material flows at a constant velocity.
 
     The mouth is the section of the shape through its centre, across the velocity. Particles move with the velocity, in
-    sheets: a layer as thick as their distance enters as one sheet, or as eight.
+    sheets: a layer as thick as the particle distance enters as one sheet or as eight.
     """
 
     has_surface: ClassVar[bool] = False
@@ -80,9 +80,11 @@ class Emitter(Table):
     name: str = Field(pattern=NAME, description="Name of the emitter, used in messages and --set.")
     material: Material
     shape: OneShape = Field(description="Its section through the centre, across the velocity, is the mouth.")
-    velocity: Vector = Field(description="Velocity of what flows in, m/s; not zero.")
-    start: NotNegative = Field(0.0, description="When the first sheet enters, s.")
-    end: Positive | None = Field(None, description="No sheet enters from then on, s. Default: the end of the scene.")
+    velocity: Vector = Field(description="Velocity of the inflow, m/s; not zero.")
+    start: NotNegative = Field(0.0, description="Time at which the first sheet enters, s.")
+    end: Positive | None = Field(
+        None, description="Time from which on no sheet enters, s. Default: the end of the scene."
+    )
     particles: Integer | None = Field(
         None, ge=1, description="Particles in all, of a lattice whole sheets; or give volume. Default: until end."
     )
@@ -120,8 +122,8 @@ USUAL_FLIP = 0.5
 
 
 def _only_with_aflip(flip: float | None, info: ValidationInfo) -> float | None:
-    """Fill in the share of FLIP where there is one, and refuse it where there is none."""
-    # An invalid transfer has a message of its own, and is absent from the data.
+    """Fill in the share of FLIP for transfer = "aflip", and refuse it for any other transfer."""
+    # An invalid transfer is absent from the data and has its own message.
     transfer = info.data.get("transfer", "aflip")
     if flip is not None and transfer != "aflip":
         raise flaw(f'is the share of FLIP in transfer = "aflip"; with transfer = "{transfer}" leave it out')
@@ -129,7 +131,7 @@ def _only_with_aflip(flip: float | None, info: ValidationInfo) -> float | None:
 
 
 class SolverSettings(Table):
-    """How the scene is computed. What is not chosen is not in the compiled step."""
+    """How the scene is computed. Options that are not chosen are absent from the compiled step."""
 
     precision: Literal["f32", "f64"] = Field("f32", description="Floating-point numbers of the solver: 32 or 64 bits.")
     kernel: Literal["quadratic", "cubic"] = Field(
@@ -140,8 +142,8 @@ class SolverSettings(Table):
     )
     transfer: Literal["apic", "aflip"] = Field(
         "apic",
-        description='What particles hand to the nodes and take back. "apic": velocity and its gradient, which '
-        'keeps angular momentum exactly. "aflip": APIC that damps only a share of what the grid does not see: waves, '
+        description='Quantities transferred to the nodes and back. "apic": velocity and its gradient, which '
+        'keeps angular momentum exactly. "aflip": APIC that damps only a share of the motion not on the grid: waves, '
         "splashes and spin lose far less; twice the memory of the grid, and some noise.",
     )
     flip: Annotated[
@@ -150,8 +152,8 @@ class SolverSettings(Table):
             strict=True,
             ge=0,
             le=1,
-            description='With transfer = "aflip": share of what the grid does not see of a particle\'s motion that it '
-            f"keeps in a step of its own. 0 is APIC, 1 damps nothing. Default: {USUAL_FLIP:g}.",
+            description='With transfer = "aflip": share of the part of a particle\'s motion that is not on the grid '
+            f"and that a step keeps. 0 is APIC, 1 damps nothing. Default: {USUAL_FLIP:g}.",
         ),
         AfterValidator(_only_with_aflip),
         Field(validate_default=True),
@@ -175,7 +177,7 @@ class SolverSettings(Table):
     )
     redistribute: Literal["auto", False] = Field(
         "auto",
-        description="Whether particles of liquids and grains are shifted out of crowds that flow piles up. "
+        description="Whether particles of liquids and grains are shifted out of crowds that the flow creates. "
         '"auto": those of fluid and sand, every 50 steps, by two fifths of their distance at most.',
     )
     deterministic: Flag = Field(
@@ -199,7 +201,7 @@ ParticleField = Literal[
 
 
 class Time(Table):
-    """How long the scene runs, how often it is stored, and how it is stepped."""
+    """The simulated time, the stored frames, and the time step."""
 
     end: Positive = Field(description="Simulated time, s; the scene starts at 0.")
     frames: Integer = Field(
@@ -223,13 +225,13 @@ def _usually_relaxed(value: object, info: ValidationInfo) -> object:
 
 
 def _usual(info: ValidationInfo) -> str:
-    """Return how the material of a body is sampled by default; points are as they are."""
+    """Return the default sampling of the material of a body; points are used as given."""
     material, shape = info.data.get("material"), info.data.get("shape")
     return "lattice" if material is None or getattr(shape, "points", None) else material.usual_sampling
 
 
 def _not_for_points(relaxed: bool, info: ValidationInfo) -> bool:
-    # An invalid shape has a message of its own, and is absent from the data.
+    # An invalid shape is absent from the data and has its own message.
     if relaxed and getattr(info.data.get("shape"), "points", None):
         raise flaw("moves particles, and points are particles as they are; leave it out")
     return relaxed
@@ -284,7 +286,7 @@ class Body(Table):
 
     @property
     def has_surface(self) -> bool:
-        """Whether particles can carry its surface: it stays elastic, and its shape is known."""
+        """Whether particles can represent its surface: it stays elastic, and its shape is known."""
         return self.material.elastic and self.shape.points is None
 
 
@@ -296,7 +298,7 @@ def _no_repeats(fields: tuple[str, ...]) -> tuple[str, ...]:
 
 
 class Output(Table):
-    """What is stored of each particle, besides its position, body and material."""
+    """Fields that are stored for each particle besides its position, body and material."""
 
     fields: Annotated[tuple[ParticleField, ...], AfterValidator(_no_repeats)] = Field(
         ("velocity", "density", "pressure"),
@@ -304,7 +306,7 @@ class Output(Table):
         "deformation_gradient F, affine C (1/s), stress (Cauchy, Pa), mass (kg), initial_position (m).",
     )
     drop_retired: Flag = Field(
-        False, description="Store only the particles that are there, so that frames differ in their numbers."
+        False, description="Store only the particles present, so that the number of particles varies between frames."
     )
     compress: Flag = Field(False, description="Compress the stored file with gzip: smaller, and slower to write.")
 
@@ -315,24 +317,26 @@ class Scene(Table):
     Built by `load_scene` or `parse_scene`. In 2D all extensive quantities are per metre of depth.
     """
 
-    title: str = Field("", description="One line that says what the scene is.")
+    title: str = Field("", description="One line that describes the scene.")
     constants: ConstantTable | None = Field(
         None,
         description="Names for numbers, or for expressions of t, x, y, z, X, Y, Z and of the names above them, "
         "which every expression of the scene may use. Default: none.",
     )
-    domain: Domain = Field(description="The box that the scene lives in, and its grid.")
-    time: Time = Field(description="How long, how many frames, which steps.")
-    bodies: tuple[Body, ...] = Field((), description="The bodies; none where emitters bring all material.")
-    emitters: tuple[Emitter, ...] = Field((), description="Where material flows in. Default: none.")
-    forces: tuple[Force, ...] = Field((), description="Accelerations beside gravity; what acts on a particle adds up.")
-    colliders: tuple[Collider, ...] = Field((), description="Rigid things that the material meets, at rest or moving.")
-    impulses: tuple[Impulse, ...] = Field(
-        (), description="Pushes on what is near a place, at a time or over an interval."
+    domain: Domain = Field(description="The box of the scene, and its grid.")
+    time: Time = Field(description="Simulated time, frames and time step.")
+    bodies: tuple[Body, ...] = Field((), description="The bodies; none if emitters bring all material.")
+    emitters: tuple[Emitter, ...] = Field((), description="Sources of inflow. Default: none.")
+    forces: tuple[Force, ...] = Field(
+        (), description="Accelerations besides gravity; those that act on a particle add up."
     )
-    contact: Contact = Field(Contact(), description="What bodies do to each other. Default: they stick.")
-    output: Output = Field(Output(), description="What is stored.")
-    solver: SolverSettings = Field(SolverSettings(), description="How it is computed.")
+    colliders: tuple[Collider, ...] = Field((), description="Rigid obstacles, at rest or moving.")
+    impulses: tuple[Impulse, ...] = Field(
+        (), description="Pushes on particles near a place, at a time or over an interval."
+    )
+    contact: Contact = Field(Contact(), description="Contact between bodies. Default: they stick.")
+    output: Output = Field(Output(), description="Stored fields and format.")
+    solver: SolverSettings = Field(SolverSettings(), description="Numerical method.")
 
     @model_validator(mode="after")
     def _has_material(self) -> "Scene":
@@ -354,25 +358,25 @@ class Scene(Table):
             return None
         if self.contact.friction is not None:
             return self.contact.friction
-        # That of the softer one, of equal ones the lower; a law of a plugin may have none.
+        # That of the softer body, the lower of two equally soft ones; a plugin's law may have none.
         materials = (first.material, second.material)
         return min((own.shear_modulus, getattr(own, "surface_friction", 0.0)) for own in materials)[1]
 
     def separates(self, source: "Body | Emitter") -> bool:
-        """Return whether a body has a velocity field of its own: its surface meets others, walls and colliders."""
+        """Return whether a body has its own velocity field: contact is then resolved at its surface."""
         named = any(source.name in pair.between and pair.friction != "stick" for pair in self.contact.pairs)
         return source.has_surface and (named or self.contact.default == "separate")
 
     @property
     def contact_pairs(self) -> tuple[tuple[str, str], ...]:
-        """Names of each pair of velocity fields, in the order of the ledger: of bodies that separate, each its own."""
+        """Names of each pair of velocity fields, in the order of the ledger; bodies that separate have their own."""
         shared = ", ".join(source.name for source in self.sources if not self.separates(source))
         names = [shared] * bool(shared) + [source.name for source in self.sources if self.separates(source)]
         return tuple((first, second) for k, second in enumerate(names) for first in names[:k])
 
     @property
     def sources(self) -> "tuple[Body | Emitter, ...]":
-        """Everything that particles belong to, in the order of their labels: the bodies, then the emitters."""
+        """All sources of particles, in the order of their labels: the bodies, then the emitters."""
         return (*self.bodies, *self.emitters)
 
     @property
@@ -395,7 +399,7 @@ class Scene(Table):
 def scene_model(laws: tuple[type[MaterialParameters], ...]) -> type[Scene]:
     """Return the scene whose materials are one of the given laws, distinguished by their key `law`.
 
-    Its output fields are those of every scene and the internal variables of these laws. Cached, so that
+    Its output fields are those of every scene and the internal variables of these laws. The model is cached, so that
     two scenes of the same laws have the same type and can be compared.
     """
     material: Any = laws[0] if len(laws) == 1 else Annotated[Union[laws], Field(discriminator="law")]  # noqa: UP007
@@ -417,7 +421,7 @@ def scene_model(laws: tuple[type[MaterialParameters], ...]) -> type[Scene]:
 
 
 def _output_model(laws: tuple[type[MaterialParameters], ...]) -> type[Output]:
-    """Return the output table that accepts the internal variables of the given laws as fields, too."""
+    """Return the output table that also accepts the internal variables of the given laws as fields."""
     variables = {variable.name: variable for law in laws for variable in law.internal}
     if not variables:
         return Output

@@ -1,4 +1,4 @@
-"""Shapes: forms, each with its volume, its bounds, an inside test and a signed distance, and composites of them."""
+"""Shapes: forms with volume, bounds, inside test and signed distance, and composites of forms."""
 
 import math
 from dataclasses import dataclass
@@ -14,19 +14,19 @@ from mpmcli.scene.points import Points
 from mpmcli.scene.primitives import Ball, Box, Capsule, Cylinder, Polygon, Solid, grid_points
 from mpmcli.scene.quantity import Table, flaw, scene_dimension
 
-# Cells along the longest axis of the bounding box, of the coarsest lattice, and times that those on the surface are
-# halved, in 2D and 3D.
+# Cells of the coarsest lattice along the longest axis of the bounding box, and number of halvings of surface cells, in
+# 2D and 3D.
 _CELLS, _HALVINGS = 8, {2: 8, 3: 4}
 _POINTS_AT_ONCE = 200_000
 
 
 def enclosed_volume(solid: Solid, fewer: int = 0) -> float:
-    """Return the volume where a signed distance is negative, m^3 (m^2 in 2D).
+    """Return the volume of the region of negative signed distance, m^3 (m^2 in 2D).
 
-    Cells that the distance shows to lie inside count as a whole. Those on the surface are halved, and in the end cut by
-    the plane with the distance and the gradient of their centre. The error falls as the square of their size, and is
+    Cells that lie inside by their distance count as a whole. Cells on the surface are halved, and at the last level cut
+    by the plane with the distance and the gradient at their centre. The error falls as the square of their size, and is
     extrapolated from cells of 1/1024 and 1/2048 (2D), 1/64 and 1/128 (3D) of the extent: below 5e-7 (2D) and 1e-5 (3D)
-    of the volume in the tests. Each of `fewer` halvings that are left out makes it some four times as large.
+    of the volume in the tests. Each of the `fewer` omitted halvings makes it about four times as large.
     """
     lower, upper = solid.bounds()
     d = len(lower)
@@ -61,10 +61,10 @@ def _distances(solid: Solid, points: np.ndarray) -> np.ndarray:
 def _shares(distance: np.ndarray, rise: np.ndarray) -> np.ndarray:
     """Return the share of cells (n,) below the plane that is `distance` at their centre and rises by (n, d) across.
 
-    The volume of the simplex that the plane cuts from a corner, less those beyond the other corners and so on.
+    It is the volume of the simplex that the plane cuts off at a corner, by inclusion and exclusion over the corners.
     """
     d = rise.shape[1]
-    # A plane along an axis is that of a slight slope, which cuts as much.
+    # A plane along an axis is replaced by one of slight slope, which cuts off the same volume.
     rise = np.maximum(rise, 1e-3 * rise.max(axis=1, keepdims=True, initial=1e-300))
     level = rise.sum(axis=1) / 2 - distance
     found = sum(
@@ -76,14 +76,14 @@ def _shares(distance: np.ndarray, rise: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Composite(Solid):
-    """What lies in any of the forms `added`, at least one, and in none of those `removed`."""
+    """The union of the forms `added`, at least one, without the forms `removed`."""
 
     added: tuple[Solid, ...]
     removed: tuple[Solid, ...] = ()
 
     @property
     def volume(self) -> float:
-        """Exact where no two forms intersect, else by quadrature; see `enclosed_volume` for its error."""
+        """Volume, m^3: exact if no two forms intersect, else by quadrature with the error of `enclosed_volume`."""
         return _volume(self)
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
@@ -91,7 +91,7 @@ class Composite(Solid):
         return np.min(lowers, axis=0), np.max(uppers, axis=0)
 
     def contains(self, points: np.ndarray, inset: float = 0.0) -> np.ndarray:
-        """Say whether points lie inside; with an inset, those are left out that are that deep in no single form."""
+        """Return whether points lie inside; with an inset, whether they lie at least that deep."""
         if inset > 0:
             return self.signed_distance(points) <= -inset
         inside = np.any([form.contains(points) for form in self.added], axis=0)
@@ -100,9 +100,9 @@ class Composite(Solid):
         return inside
 
     def signed_distance(self, points: np.ndarray) -> np.ndarray:
-        """Return the smallest distance of what is added, and the largest of it and what is left by what is removed.
+        """Return the maximum of the smallest distance from `added` and the negative distances from `removed`, (n,), m.
 
-        No point is nearer to the surface; where forms intersect, some are farther.
+        It is a lower bound on the true distance; where forms intersect, some points are farther from the surface.
         """
         distance = np.min([form.signed_distance(points) for form in self.added], axis=0)
         for form in self.removed:
@@ -114,7 +114,7 @@ class Composite(Solid):
 def _volume(form: Composite) -> float:
     if all(any(_holds(other, one) for other in form.removed) for one in form.added):
         return 0.0
-    # What does not meet the bounding box of anything takes nothing from it.
+    # A removed form that meets no bounding box of an added one removes nothing.
     removed = [one for one in form.removed if any(_boxes_meet(one, other) for other in form.added)]
     lone = not any(_boxes_meet(*pair) for forms in (form.added, removed) for pair in combinations(forms, 2))
     if lone and all(any(_holds(other, one) for other in form.added) for one in removed):
@@ -128,7 +128,7 @@ def _boxes_meet(first: Solid, second: Solid) -> bool:
 
 
 def _holds(outer: Solid, inner: Solid) -> bool:
-    """Say whether a convex form holds another one as a whole; False where it is not known."""
+    """Return whether a convex form contains another one; False if unknown."""
     if not isinstance(outer, Box | Ball | Capsule | Cylinder):
         return False
     match inner:
@@ -172,7 +172,7 @@ Others = tuple[Annotated["Shape", AfterValidator(exactly_one_form)], ...] | None
 
 
 class Shape(Table):
-    """A form: exactly one of those below, with others added to it and taken from it."""
+    """A shape: exactly one of the forms below, with shapes added and subtracted."""
 
     box: Box | None = Field(None, description="A box with faces along the axes.")
     ball: Ball | None = Field(None, description="A ball; a disc in 2D.")
@@ -183,19 +183,17 @@ class Shape(Table):
         None, description="A round cylinder; 3D only."
     )
     mesh: Annotated[Mesh | None, _only_in(3, "box, ball, capsule or polygon")] = Field(
-        None, description="What a closed surface encloses, from a file; 3D only."
+        None, description="The interior of a closed surface from a file; 3D only."
     )
     polygon: Annotated[Polygon | None, _only_in(2, "box, ball, capsule, cylinder or mesh")] = Field(
         None, description="A polygon; 2D only."
     )
-    add: Others = Field(None, description="Shapes that belong to it as well. Default: none.")
-    subtract: Others = Field(
-        None, description="Shapes that are taken from the form and from what is added. Default: none."
-    )
+    add: Others = Field(None, description="Shapes added to the form. Default: none.")
+    subtract: Others = Field(None, description="Shapes subtracted from the form and the added shapes. Default: none.")
 
     @property
     def form(self) -> Form:
-        """The form that is given, or the composite of it and others."""
+        """The given form, or its composite with other shapes."""
         single = next(form for name, form in self if form is not None and name not in COMBINED)
         if not (self.add or self.subtract):
             return single
@@ -209,7 +207,7 @@ class Shape(Table):
 
 
 class BodyShape(Shape):
-    """The shape of a body: a form as other shapes, or points from a file."""
+    """The shape of a body: a form, or points from a file."""
 
     points: Points | None = Field(None, description="Points from a file, each of which is a particle of the body.")
 

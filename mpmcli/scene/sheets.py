@@ -1,7 +1,7 @@
-"""The particles that an emitter lets in, sheet after sheet: where they lie, how many there are, and when they come.
+"""The particles of an emitter, sheet after sheet: their positions, number and times of entry.
 
-A layer has a particle for each cell of the lattice on the mouth. It enters as one sheet, or as several, one after the
-other: a slow stream that gravity stretches tears between sheets that are as far apart as particles.
+A layer has a particle for each cell of the lattice on the mouth. It enters as one sheet, or as several in succession: a
+slow stream stretched by gravity would tear between sheets that are a particle distance apart.
 """
 
 import math
@@ -14,11 +14,11 @@ from mpmcli.scene.primitives import grid_points
 from mpmcli.scene.schema import Emitter, Scene
 from mpmcli.scene.shapes import Shape
 
-# Points along each axis of a mouth at which its area is measured, in 2D and 3D: to 3e-4 and to 1e-3.
+# Points along each axis of a mouth for its area, in 2D and 3D; the error is 3e-4 and 1e-3.
 _MEASURED = {2: 4096, 3: 768}
-# Sheets that are a part of a period late count as in time.
+# Sheets late by at most this fraction of a period count as on time.
 _SLACK = 1e-9
-# Sheets of a layer, where they are not the whole of it.
+# Sheets per layer, if a layer is divided.
 _PER_LAYER = 8
 # Golden and plastic number, the smallest real roots above 1 of z^2 = z + 1 and z^3 = z + 1.
 _ROOTS = {2: (1 + math.sqrt(5)) / 2, 3: 1.3247179572447460}
@@ -64,10 +64,10 @@ class Sheets:
         return -(-self.particles // max(1, self.size))
 
     def places(self, emitter: Emitter) -> np.ndarray:
-        """Return where all particles enter, (n, d), m, in the order in which they do.
+        """Return the positions of entry of all particles, (n, d), m, in the order of entry.
 
-        Those of a sheet that is a part of a layer lie in front of the mouth, where they would be had each entered at a
-        time of its own since the sheet before.
+        The particles of a partial sheet lie in front of the mouth, as if each had entered at its own time since the
+        previous sheet.
         """
         mouth, number = self.mouth, np.arange(self.particles)
         filled = np.argwhere(mouth.filled)
@@ -90,10 +90,10 @@ def _even_cells(mouth: Mouth, shape: Shape, count: int) -> np.ndarray:
     """Return points of an even sequence on the lattice of a mouth, (count, d - 1), in cells.
 
     Point k of the sequence is (k / r mod 1, k / r^2 mod 1), r the golden number in 2D and the plastic one in 3D. With k
-    as one more coordinate these are points of a lattice, which keep apart however it is stretched along that one
-    (docs/theory.md, 5.13).
+    as an additional coordinate they are points of a lattice whose points stay apart under any stretch along that
+    coordinate (docs/theory.md, 5.13).
     """
-    # Of the lattice a part is filled, and of the sequence about as much.
+    # A fraction of the lattice is filled, and about the same fraction of the sequence is used.
     many, d = 16 + int(1.1 * count * mouth.filled.size / max(1, mouth.filled.sum())), len(mouth.centre)
     steps = _ROOTS[d] ** -np.arange(1.0, d)
     while True:
@@ -114,7 +114,7 @@ def _mouth(shape: Shape, velocity: tuple[float, ...], particles_per_cell: int, h
     d, form = len(velocity), shape.form
     direction = np.array(velocity) / np.linalg.norm(velocity)
     centre, axes, reach = _section(shape, direction)
-    # The section, finely: its extent and its area.
+    # A fine sampling of the section gives its extent and its area.
     n = _MEASURED[d]
     steps = 2 * reach / n
     fine = grid_points(*[-r + (np.arange(n) + 0.5) * s for r, s in zip(reach, steps, strict=True)])
@@ -138,16 +138,16 @@ def _mouth(shape: Shape, velocity: tuple[float, ...], particles_per_cell: int, h
 
 
 def most_in_mouth(emitter: Emitter, h: float) -> float:
-    """Return a bound on the number of particles in a mouth, in a time that does not depend on it."""
+    """Return a bound on the number of particles in a mouth, in constant time."""
     direction = np.array(emitter.velocity) / np.linalg.norm(emitter.velocity)
     spacing = h / emitter.particles_per_cell ** (1 / len(direction))
     return float(np.prod(np.maximum(1.0, 2 * _section(emitter.shape, direction)[2] / spacing)))
 
 
 def _section(shape: Shape, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the centre of a shape, axes normal to a direction, (d - 1, d), and how far it reaches along them."""
+    """Return the centre of a shape, axes normal to a direction, (d - 1, d), and its extent along them."""
     lower, upper = (np.array(bound, float) for bound in shape.form.bounds())
-    # The axes of the scene that lie most across the flow, made normal to it.
+    # The scene axes closest to normal to the flow, made normal to it.
     across: list[np.ndarray] = []
     for axis in np.argsort(np.abs(direction), kind="stable")[: len(direction) - 1]:
         vector = np.eye(len(direction))[axis]
@@ -161,8 +161,8 @@ def _section(shape: Shape, direction: np.ndarray) -> tuple[np.ndarray, np.ndarra
 def sheets_of(emitter: Emitter, scene: Scene) -> Sheets:
     """Return the sheets of an emitter of a scene.
 
-    A layer holds the material of a slice of the mouth that is as thick as sheets of a lattice are apart, so that the
-    flow is the area times the speed.
+    A layer contains the material of a slice of the mouth as thick as the distance of the lattice sheets, so that the
+    volume flow is the area times the speed.
     """
     mouth = mouth_of(emitter, scene.domain.spacing)
     layer, whole = int(mouth.filled.sum()), emitter.sampling == "lattice"
@@ -179,6 +179,6 @@ def sheets_of(emitter: Emitter, scene: Scene) -> Sheets:
 
 
 def most_until_end(emitter: Emitter, scene: Scene, period: float, size: int) -> int:
-    """Return how many particles enter up to the end of an emitter, or of its scene, in sheets of a size."""
+    """Return the number of particles that enter until the end of an emitter or its scene, in sheets of a size."""
     end = min(scene.time.end, math.inf if emitter.end is None else emitter.end)
     return max(0, math.ceil((end - emitter.start) / period - _SLACK)) * size

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """The surface of a thing.
+    """The surface of a body.
 
-    A segment has the thing on its left; a triangle has it behind, seen from where its corners run counterclockwise.
+    A segment has the body on its left; a triangle has it behind, seen from where its corners run counterclockwise.
     """
 
     points: np.ndarray  # (n, d), m
@@ -29,12 +29,12 @@ class Surface:
 
     @property
     def flipped(self) -> "Surface":
-        """The same with the thing on the other side."""
+        """The same surface with the body on the other side."""
         return Surface(self.points, self.cells[:, ::-1])
 
     @property
     def normals(self) -> np.ndarray:
-        """Unit normals of the cells, away from the thing, (m, d); zeros where a cell has no extent."""
+        """Unit normals of the cells, away from the body, (m, d); zeros for a cell without extent."""
         across = self._across
         return across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-300)
 
@@ -78,7 +78,7 @@ def joined(surfaces: list[Surface], dimension: int) -> Surface:
 
 
 def ring(points: np.ndarray) -> Surface:
-    """Return a closed outline through points (n, 2), counterclockwise whichever way they go."""
+    """Return a closed outline through points (n, 2) in either order, counterclockwise."""
     x, y = points.T
     if np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y) < 0:
         points = points[::-1]
@@ -87,7 +87,7 @@ def ring(points: np.ndarray) -> Surface:
 
 
 def within(surface: Surface, lower: np.ndarray, upper: np.ndarray, *, caps: bool) -> Surface:
-    """Return what lies of a surface within a box; with `caps`, closed again where the box cuts it (3D)."""
+    """Return the part of a surface within a box; with `caps`, closed again where the box cuts it (3D)."""
     if len(surface.points) == 0:
         return surface
     if (surface.points.min(axis=0) >= lower).all() and (surface.points.max(axis=0) <= upper).all():
@@ -131,15 +131,15 @@ def _triangles_within(surface: Surface, lower: np.ndarray, upper: np.ndarray, ca
     found = surface_of(output)
     if caps or len(found.cells) == 0:
         return found
-    # Label 0 marks what the input had.
+    # Label 0 marks the cells of the input.
     return Surface(found.points, found.cells[output.cell_data.active_scalars == 0])
 
 
 def poly_data(surface: Surface) -> "pv.PolyData":
-    """Return triangles as PyVista's."""
+    """Return triangles as PyVista's polygonal data."""
     import pyvista as pv
 
-    # VTK 9.7's clip takes cell arrays of one stored size for others.
+    # VTK 9.7's clip confuses cell arrays of one stored size with others.
     return pv.PolyData(surface.points, np.insert(surface.cells, 0, 3, axis=1))
 
 
@@ -157,7 +157,7 @@ BOX = [(0, 4, 6, 2), (1, 3, 7, 5), (0, 1, 5, 4), (2, 6, 7, 3), (0, 2, 3, 1), (4,
 
 
 def form_surface(form: Any) -> Surface:
-    """Return the closed surface of a form: corners, turned profiles of round forms, level sets of all others."""
+    """Return the closed surface of a form: corners, rotated profiles of round forms, or level sets of all others."""
     if isinstance(form, Polygon):
         return ring(np.array(form.vertices))
     if isinstance(form, Box):
@@ -189,7 +189,7 @@ def form_surface(form: Any) -> Surface:
 def level_surface(
     distance: Callable[[np.ndarray], np.ndarray], lower: np.ndarray, upper: np.ndarray, cells: int = CELLS
 ) -> Surface:
-    """Return where a signed distance is zero between two corners, on a grid of `cells` along the longest side."""
+    """Return the zero level of a signed distance between two corners, on a grid of `cells` along the longest side."""
     import pyvista as pv
 
     d = len(lower)
@@ -222,7 +222,7 @@ def oriented(surface: Surface, distance: Callable[[np.ndarray], np.ndarray]) -> 
 
 
 def without_doubles(surface: Surface) -> Surface:
-    """Return triangles whose corners at one place are one point."""
+    """Return triangles with coincident corners merged."""
     return surface_of(poly_data(surface).clean(tolerance=0.0, lines_to_points=False, polys_to_lines=False))
 
 
@@ -250,9 +250,9 @@ def _beside(axis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _turned(start: np.ndarray, axis: np.ndarray, profile: np.ndarray) -> Surface:
-    """Return the surface of a profile that turns about an axis, a unit vector, through a place `start`, (3,), m.
+    """Return the surface of revolution of a profile about an axis, a unit vector, through a point `start`, (3,), m.
 
-    The profile has places along the axis, falling, and distances from it, (n, 2), m; 0 at both ends.
+    The profile has positions along the axis, decreasing, and distances from it, 0 at both ends, (n, 2), m.
     """
     around = 2 * ARC
     u, v = _beside(axis)
@@ -275,7 +275,7 @@ def _turned(start: np.ndarray, axis: np.ndarray, profile: np.ndarray) -> Surface
 
 # Cosine of the angle from which on an edge is sharp.
 SHARP = math.cos(math.radians(30.0))
-# Least distance in spacings: as close as random disks lie on average, one to a square of the spacing.
+# Smallest distance in spacings: the mean distance of random disks, one to a square of the spacing.
 APART = 0.78
 # Candidates to a square of the spacing.
 CANDIDATES = 24
@@ -285,7 +285,7 @@ SEED = 0
 def surface_points(surface: Surface, spacing: float) -> np.ndarray:
     """Return points on a surface, (n, d), about one to a length (2D) or square (3D) of the spacing, m.
 
-    Corners in 2D, and sharp edges in 3D, have points of their own. The same surface always gives the same.
+    Corners in 2D, and sharp edges in 3D, have points of their own. The result is deterministic.
     """
     if len(surface.cells) == 0:
         return np.empty((0, surface.points.shape[1]))
@@ -293,8 +293,7 @@ def surface_points(surface: Surface, spacing: float) -> np.ndarray:
         return np.concatenate([_along(chain, spacing) for chain in surface.chains()])
     from scipy.spatial import cKDTree
 
-    # Of the candidates, those on sharp edges first and the others at random, each is taken that is apart from all
-    # before it.
+    # Candidates on sharp edges come first, the others in random order; each is taken if it is apart from all before it.
     random = np.random.default_rng(SEED)
     shares = surface.sizes / surface.sizes.sum()
     count = max(math.ceil(CANDIDATES * surface.sizes.sum() / spacing**2), 1)
@@ -312,7 +311,7 @@ def _along(chain: np.ndarray, spacing: float) -> np.ndarray:
     chain = chain[[True, *(np.diff(chain, axis=0) != 0).any(axis=1)]]
     closed = len(chain) > 2 and np.array_equal(chain[0], chain[-1])
     if closed:
-        # It begins at a corner, if there is one.
+        # Begin at a corner, if there is one.
         turns = np.flatnonzero(_turns(np.concatenate([chain[-2:-1], chain])))
         chain = np.roll(chain[:-1], -int(turns[0]) if len(turns) else 0, axis=0)
         chain = np.concatenate([chain, chain[:1]])
@@ -329,7 +328,7 @@ def _along(chain: np.ndarray, spacing: float) -> np.ndarray:
 
 
 def _turns(chain: np.ndarray) -> np.ndarray:
-    """Say of the points of a line (k, 2), but for its ends, whether it turns there, (k - 2,)."""
+    """Return whether a line (k, 2) turns at each of its points but the ends, (k - 2,)."""
     along = np.diff(chain, axis=0)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     return np.sum(along[1:] * along[:-1], axis=1) < SHARP
@@ -355,9 +354,9 @@ def _edge_points(surface: Surface, spacing: float) -> np.ndarray:
 
 
 def collider_surface(collider: Collider, lower: np.ndarray, upper: np.ndarray) -> Surface:
-    """Return the surface of a collider where its shape stands, before `Motion` moves it; the material is before it.
+    """Return the surface of a collider at its shape, before `Motion` moves it; the material is in front of it.
 
-    Planes, containers and what never moves are cut off at the domain, at time 0, with these corners, (d,), m.
+    Planes, containers and colliders at rest are cut off at the domain, at time 0, with these corners, (d,), m.
     """
     if isinstance(collider.form, Plane):
         return _plane(collider, lower, upper)
@@ -372,7 +371,7 @@ def collider_surface(collider: Collider, lower: np.ndarray, upper: np.ndarray) -
 
 
 def _plane(collider: Collider, lower: np.ndarray, upper: np.ndarray) -> Surface:
-    """Return the part of a plane that lies in the domain; of one that misses it, of the parallel one that touches."""
+    """Return the part of a plane in the domain; if it misses the domain, of the parallel plane that touches it."""
     motion, form = collider.motion, collider.form
     inside = collider.side == "inside"
     point = motion.placed(np.array([form.point]), 0.0)[0]
@@ -381,7 +380,7 @@ def _plane(collider: Collider, lower: np.ndarray, upper: np.ndarray) -> Surface:
     middle, half = 0.5 * (lower + upper), 0.5 * (upper - lower)
     reach = float(np.abs(normal) @ half)
     away = float((point - middle) @ normal)
-    # Where it lies on a face of the domain, rounding must not cut it off.
+    # Rounding must not cut off a plane on a face of the domain.
     shift = away - np.clip(away, -(1 - 1e-12) * reach, (1 - 1e-12) * reach)
     center = middle + (away - shift) * normal
     far = 2.0 * float(np.linalg.norm(half))

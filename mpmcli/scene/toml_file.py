@@ -1,4 +1,4 @@
-"""The TOML of a scene: how it is read, where in it each key stands, what `--set` replaces, and how it is written."""
+"""The TOML of a scene: reading, line numbers of keys, overrides by `--set`, and writing."""
 
 import re
 import tomllib
@@ -16,19 +16,19 @@ from mpmcli.scene.problem import Path, hint_at, listed, nearest_entry, path_text
 from mpmcli.scene.quantity import dimension_of
 from mpmcli.scene.schema import Scene
 
-# Lists and tables within one another. No scene needs a fifth of it, and Python's own stack ends at some hundreds.
+# Largest nesting depth of lists and tables. No scene needs a fifth of it; Python's stack ends at some hundreds.
 MOST_NESTED = 60
 
 
 def copied(tree: Any) -> Any:
-    """Return a copy of tables and lists, in which no table is in two places, as callers in Python may have it."""
+    """Return a copy of tables and lists without shared tables, which callers in Python may pass."""
     if isinstance(tree, dict):
         return {key: copied(value) for key, value in tree.items()}
     return [copied(value) for value in tree] if isinstance(tree, list) else tree
 
 
 def too_deep(tree: Any) -> bool:
-    """Say whether tables and lists lie deeper within one another than MOST_NESTED."""
+    """Return whether tables and lists are nested deeper than MOST_NESTED."""
     level = [tree]
     for _ in range(MOST_NESTED):
         level = [
@@ -43,10 +43,10 @@ def too_deep(tree: Any) -> bool:
 
 
 _POSITION = re.compile(r" \(at (?:line (\d+), column (\d+)|end of document)\)$")
-# Messages of tomllib that a plainer sentence replaces.
+# Messages of tomllib, and the plainer sentences that replace them.
 _SYNTAX = {
     "Cannot overwrite a value": "this key is given twice",
-    "Invalid value": "this is no TOML value; text needs quotes, numbers and lists none",
+    "Invalid value": "this is not a TOML value; text needs quotes, numbers and lists none",
     "Expected '=' after a key in a key/value pair": "expected key = value",
     "Invalid initial character for a key part": "expected a key; a table in { } stands on one line",
     "Unclosed array": "a list is not closed with ]",
@@ -55,11 +55,11 @@ _SYNTAX = {
 
 
 def read_toml(path: str | PathLike[str], kind: str = "scene") -> tuple[str, dict[str, Any]]:
-    """Return the text of a TOML file, and what it holds.
+    """Return the text of a TOML file, and its parsed data.
 
     Args:
         path: the file.
-        kind: what the file describes, one word, for errors.
+        kind: subject of the file, one word, for errors.
 
     Raises:
         InputError: the file cannot be read, or is not valid TOML.
@@ -78,7 +78,7 @@ def read_toml(path: str | PathLike[str], kind: str = "scene") -> tuple[str, dict
         raise InputError(f"{file}: this is a directory; {hint}") from None
     except UnicodeDecodeError as error:
         raise InputError(
-            f"{file}: this is no text in UTF-8 (byte {error.start} is {error.object[error.start]:#04x}); "
+            f"{file}: this is not text in UTF-8 (byte {error.start} is {error.object[error.start]:#04x}); "
             f"give a {kind} in TOML"
         ) from None
     except (OSError, ValueError) as error:
@@ -122,13 +122,13 @@ def key_lines(text: str) -> dict[Path, int]:
 
 
 def line_of(path: Path, lines: dict[Path, int]) -> int | None:
-    """Return the line of a path or of the nearest table around it, or None when neither is in the text."""
+    """Return the line of a path or of the nearest table around it, or None if neither is in the text."""
     found = nearest_entry(path, lines)
     return None if found is None else found[0]
 
 
 class _Scanner:
-    """Follows the structure of a text that `tomllib` has checked already."""
+    """Scans the structure of a text that `tomllib` has already checked."""
 
     def __init__(self, text: str) -> None:
         self.text = text.replace("\r\n", "\n")
@@ -210,7 +210,7 @@ class _Scanner:
         return match[0]
 
     def _record(self, path: Path, at: int) -> None:
-        # A dotted header names tables on the way that may have no line of their own.
+        # The parent tables in a dotted header may have no line of their own.
         for end in range(1, len(path) + 1):
             self.lines.setdefault(path[:end], bisect_right(self.breaks, at) + 1)
 
@@ -227,8 +227,8 @@ def apply_overrides(data: dict[str, Any], overrides: Sequence[str]) -> tuple[dic
 
     An override is `KEY=VALUE`. KEY is a path, `time.end`, in which an entry of a list is named by its index,
     `bodies[0].velocity` or `bodies.0.velocity`, and a body also by its name, `bodies.column.velocity`. VALUE is a TOML
-    value; a bare word is taken as text. Whether the scene has the key is left to validation. An InputError has a line
-    for every override that cannot be read or placed.
+    value; a bare word is taken as text. Validation checks whether the scene has the key. An InputError has a line for
+    every override that cannot be read or placed.
     """
     if too_deep(data):
         raise InputError("lists or tables of the scene are too deep")
@@ -253,7 +253,7 @@ def apply_overrides(data: dict[str, Any], overrides: Sequence[str]) -> tuple[dic
 def key_parts(key: str) -> list[str]:
     """Return the parts of a key as `apply_overrides` takes it, indices as text, or raise an InputError."""
     if not _PATH.fullmatch(key):
-        raise InputError(f'"{key}" is no key; a key is a path such as time.end or bodies[0].velocity')
+        raise InputError(f'"{key}" is not a key; a key is a path such as time.end or bodies[0].velocity')
     parts = [index or name.strip() for index, name in _PART.findall(key)]
     if len(parts) > MOST_NESTED:
         raise InputError(f'"{key[:40]}..." has {len(parts)} parts, and no value of a scene lies so deep')
@@ -268,7 +268,7 @@ def _value_of(text: str) -> object:
     except (ValueError, RecursionError):
         if _BARE_WORD.fullmatch(text):
             return text
-    raise InputError(f"{text or 'nothing'} is no TOML value; write a number, a list or a word, or text in quotes")
+    raise InputError(f"{text or 'nothing'} is not a TOML value; write a number, a list or a word, or text in quotes")
 
 
 def set_value(data: dict[str, Any], parts: list[str], value: object) -> Path:
@@ -293,7 +293,7 @@ def set_value(data: dict[str, Any], parts: list[str], value: object) -> Path:
         if position == len(parts) - 1:
             at[key] = value
         elif path[0] in ("bodies", "emitters") and path[2:] == ("material",) and isinstance(at.get(key), str):
-            # A preset that was written as one word becomes a table, so that something can be added to it.
+            # A preset written as one word becomes a table, so that keys can be added.
             at[key] = {"preset": at[key]}
             at = at[key]
         elif isinstance(at, dict) and part in _ZEROS and parts[position + 1].isdecimal():
@@ -331,8 +331,8 @@ _OWN_TABLE = ("material",)
 def scene_to_toml(scene: Scene) -> str:
     """Write a scene as TOML; loading the text again gives an equal scene.
 
-    Only `domain.spacing` is written, which determines `domain.cells`. Materials are laws with physical
-    parameters, whatever presets and knobs they came from.
+    Only `domain.spacing` is written, which determines `domain.cells`. Presets and knobs are written as laws with
+    physical parameters.
     """
     data = scene.model_dump(exclude_none=True, exclude={"domain": {"cells"}})
     return "\n\n".join(block for name, value in data.items() for block in _blocks(name, value)) + "\n"

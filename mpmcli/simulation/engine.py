@@ -1,4 +1,4 @@
-"""Chooses what computes a scene by the forecast of the check, and compiles kernels ahead."""
+"""Chooses the backend of a scene by the forecast of the check, and compiles kernels in advance."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -26,17 +26,17 @@ def backend_for(
 
 # Time limit of a process, s.
 TIMEOUT = 1800.0
-# No step of a scene is as small, s: it compiles, and computes nothing worth keeping.
+# Step of a run that only compiles, s; smaller than the step of any scene.
 NO_STEP = 1e-12
 
 
 @dataclass(frozen=True)
 class Warmed:
-    """The outcome of a process.
+    """The outcome of compiling a scene in a process.
 
     Attributes:
         stored: whether a stored kernel was found; seconds: of wall time.
-        fault: why there is no outcome, "" if there is one.
+        fault: reason of a failure, "" on success.
     """
 
     scene: Path
@@ -52,7 +52,7 @@ def warm(
     threads: int | None = None,
     stop: Callable[[], bool] = lambda: False,
 ) -> Iterator[Warmed]:
-    """Take a step of each scene in a process of its own, and yield outcomes as they end."""
+    """Compute one step of each scene in a separate process, and yield outcomes as they end."""
     compile_one = partial(_compile, arch=arch, threads=threads)
     for scene, outcome in in_processes(scenes, at_once, compile_one, TIMEOUT, stop):
         yield Warmed(scene, fault=outcome.words) if isinstance(outcome, Fault) else outcome

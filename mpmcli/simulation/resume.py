@@ -1,4 +1,4 @@
-"""What an earlier run left in a directory, and whether a scene can go on from it."""
+"""Finds the state that an earlier run left in a directory, and decides whether a scene can resume it."""
 
 import math
 import os
@@ -28,16 +28,16 @@ from mpmcli.solver.engine.run import Run
 from mpmcli.solver.engine.saved_state import SavedState
 from mpmcli.solver.machine.backend import Backend
 
-# What may change between two parts of a run: it may end later, with frames as far apart, and its file be compressed.
+# Keys that may change at a resumption: the end, with frames equally far apart, and the compression of the file.
 MAY_CHANGE = ("time.end", "time.frames", "output.compress")
 _NONE = object()
 
 
 @dataclass(frozen=True)
 class Resumption:
-    """Sound frames, the newest checkpoint among them, and the record of a run that goes on, unless `complete`.
+    """Undamaged frames, the newest checkpoint within them, and the record of a run to be resumed, unless `complete`.
 
-    The packed file has `packed` of the frames.
+    The packed file contains `packed` of the frames.
     """
 
     index: FrameIndex | None
@@ -48,12 +48,12 @@ class Resumption:
 
     @property
     def step(self) -> int:
-        """Steps taken where it goes on."""
+        """Number of steps taken before the resumption."""
         return 0 if self.checkpoint is None else self.checkpoint.step
 
     @property
     def note(self) -> str:
-        """Where the run goes on, a sentence."""
+        """A sentence on the point of resumption."""
         if self.complete:
             return f"resumed: all {self.frames} frames are there"
         point = self.checkpoint
@@ -62,20 +62,20 @@ class Resumption:
 
     @property
     def frames(self) -> int:
-        """Frames that are there."""
+        """Number of existing frames."""
         return 0 if self.index is None else len(self.index.times)
 
     @property
     def rows(self) -> list[LedgerRow]:
-        """Their ledger."""
+        """The ledger of the existing frames."""
         return [] if self.index is None else self.index.ledger
 
 
 def find_resumption(loaded: LoadedScene, directory: Path) -> Resumption | None:
-    """Return how a scene goes on in a directory, None if it is empty; InputError: it holds something else."""
+    """Return the resumption of a scene in a directory, None if the directory is empty; InputError: not its run."""
     record = read_record(directory) if directory.is_dir() else None
     if not has_frames(directory):
-        # Killed before it had written anything, or not begun.
+        # Killed before anything was written, or not begun.
         names = [path.name for path in directory.iterdir()] if directory.is_dir() else []
         if record is not None or all(name == LOCK or name.endswith(TEMPORARY_SUFFIX) for name in names):
             return None
@@ -90,9 +90,9 @@ def find_resumption(loaded: LoadedScene, directory: Path) -> Resumption | None:
 
 
 def go_on(run: Run, resumption: Resumption, backend: Backend, *, forced: bool) -> None:
-    """Put the checkpoint's state, if any, in place of the start; InputError: another backend, --force, or particles."""
+    """Replace the initial state by that of the checkpoint, if any; InputError: backend, --force or particles differ."""
     point = resumption.checkpoint
-    # Frames that were stored before any checkpoint are kept as well.
+    # Frames stored before the first checkpoint are also kept.
     began = resumption.record.get("forced", forced) if point is None else point.forced
     if began != forced:
         raise InputError(f"The run was begun with{'' if began else 'out'} --force: resume it in the same way.")
@@ -109,7 +109,7 @@ def go_on(run: Run, resumption: Resumption, backend: Backend, *, forced: bool) -
 
 
 def require_same_run(resumption: Resumption, header: Mapping[str, Any], directory: Path) -> None:
-    """Refuse with InputError to add frames of another header to those of a run, as they could not be packed."""
+    """Raise an InputError if the header differs from that of the stored frames, which prevents packing."""
     before = {} if resumption.index is None else resumption.index.header
     for key in (key for key in header if before and key != "scene"):
         if before.get(key) != header[key]:
@@ -120,12 +120,12 @@ def require_same_run(resumption: Resumption, header: Mapping[str, Any], director
 
 
 def take_over(directory: Path, resumption: Resumption) -> None:
-    """Make the frames that are there the first segments of the run, and remove damaged ones and what follows them.
+    """Make the existing frames the first segments of the run, and remove damaged frames and all after them.
 
     A damaged packed file is set aside until the run is complete.
     """
     packed, folder = directory / PACKED, directory / SEGMENTS
-    # It is written anew from all frames.
+    # It is written again from all frames.
     remove_series(directory)
     if resumption.packed:
         folder.mkdir(exist_ok=True)
@@ -135,7 +135,7 @@ def take_over(directory: Path, resumption: Resumption) -> None:
         if not resumption.packed <= number_of(path) < resumption.frames:
             path.unlink()
     if resumption.packed:
-        # Before: a segment whose frames the packed file has must not come back beside it.
+        # Make the removals durable first: a segment whose frames are in the packed file must not reappear.
         sync_directory(folder)
         os.replace(packed, folder / segment_name(0))
         sync_directory(folder)
@@ -143,7 +143,7 @@ def take_over(directory: Path, resumption: Resumption) -> None:
 
 
 def file_digests(loaded: LoadedScene) -> dict[str, str]:
-    """Return SHA-256 of each file that a scene reads, by its name in the scene, and of plugins that it needs."""
+    """Return the SHA-256 of each file that a scene reads, by its name in the scene, and of each plugin it needs."""
     scene, found = loaded.scene, {}
     for law in sorted({body.material.law for body in scene.sources}):
         if plugin := plugin_file(law):
@@ -156,7 +156,7 @@ def file_digests(loaded: LoadedScene) -> dict[str, str]:
 
 
 def _sound_index(directory: Path) -> tuple[FrameIndex | None, int]:
-    """Return the index of the sound frames from the first one on, and how many of them the packed file has."""
+    """Return the index of the undamaged frames from the first on, and how many of them are in the packed file."""
     found: list[FrameIndex] = []
     packed = directory / PACKED
     if packed.exists() and verify_file(packed).sound:
@@ -168,7 +168,7 @@ def _sound_index(directory: Path) -> tuple[FrameIndex | None, int]:
         index = read_index_of(path)
         first = int(index.frames[0])
         if first < count:
-            # The packed file has it.
+            # The packed file contains it.
             continue
         if first > count or index.frames.tolist() != list(range(first, first + len(index.frames))):
             break
@@ -209,7 +209,7 @@ def _require_same_files(loaded: LoadedScene, record: Mapping[str, Any], director
 
 
 def _changes(place: str, old: object, new: object) -> Iterator[tuple[str, object, object]]:
-    """Yield the key path, the old and the new value of what differs."""
+    """Yield the key path, the old and the new value of each difference."""
     if isinstance(old, dict) and isinstance(new, dict):
         for key in sorted({*old, *new}):
             yield from _changes(f"{place}.{key}".lstrip("."), old.get(key, _NONE), new.get(key, _NONE))

@@ -1,4 +1,4 @@
-"""Computes many scenes, one after another, in one process: scenes of one kind share the device and its kernels."""
+"""Computes many scenes in one process; scenes of one kind share the device and its kernels."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -22,7 +22,7 @@ from mpmcli.solver.machine.plan import make_plan, power_of_two, require_memory
 
 @dataclass(frozen=True)
 class Recording:
-    """A run with T frames and rows, fewer where it stopped, its verdict, and why that is not "stable"."""
+    """A run with T frames and rows, fewer if it stopped, its verdict, and the reason if that is not "stable"."""
 
     header: RunHeader
     frames: Sequence[Frame]
@@ -34,7 +34,7 @@ class Recording:
 
 
 class Recorder:
-    """Keeps the frames of a run while it goes on."""
+    """Collects the frames of a run in progress."""
 
     def __init__(self, run: Run, scene: Scene, backend: Backend) -> None:
         facts = {"arch": backend.arch, "threads": backend.threads, "precision": backend.precision}
@@ -64,7 +64,7 @@ class Recorder:
 
 
 def record(run: Run, scene: Scene, backend: Backend, stop: Callable[[], bool] = lambda: False) -> Recording:
-    """Run a scene to its end or to where it stops; KeyboardInterrupt where `stop` returned True."""
+    """Run a scene until it ends or stops; KeyboardInterrupt: `stop` returned True."""
     recorder = Recorder(run, scene, backend)
     try:
         for frame, row in run.frames(stop):
@@ -74,16 +74,17 @@ def record(run: Run, scene: Scene, backend: Backend, stop: Callable[[], bool] = 
     return recorder.finished()
 
 
-# Kinds whose kernels are kept at once, and particles below which a scene is computed by kernels that are kept.
+# Largest number of kinds with kept kernels, and largest number of particles of a scene that uses kept kernels.
 MOST_KINDS, FEW_PARTICLES = 8, 20_000
-# Runs that advance at once on a GPU.
+# Runs that advance together on a GPU.
 MOST_RUNS = 256
 
 
 class Runner:
-    """Computes scenes with kernels that stay compiled.
+    """Computes scenes with kernels that are kept.
 
-    Taichi frees all fields at once: the backend restarts for kinds that need more room, and for large scenes.
+    Taichi can only free all fields at once, so the backend restarts for kinds that need more memory, and for large
+    scenes.
     """
 
     def __init__(
@@ -94,14 +95,14 @@ class Runner:
         *,
         most_runs: int = MOST_RUNS,
     ) -> None:
-        """Choose the backend; `threads` are for many particles, and `most_runs` advance at once on a GPU."""
+        """Choose the backend; `threads` are for many particles, and `most_runs` advance together on a GPU."""
         self._arch, self._threads, self._optimisation = arch, threads, optimisation
         self._most_runs = most_runs
         self._backend: Backend | None = None
         self._batches: list[Batch] = []
 
     def expect(self, scenes: Iterable[Scene]) -> None:
-        """Make room for scenes to come, so that they need no restart."""
+        """Reserve memory for scenes that follow, so that they need no restart."""
         kinds: list[CompiledKind] = []
         backend = None
         for scene in scenes:
@@ -119,7 +120,7 @@ class Runner:
             self._batch_for(kind, backend)
 
     def run(self, scene: Scene, stop: Callable[[], bool] = lambda: False) -> Recording:
-        """Run a scene to its end or where it stops; InputError: it cannot be run; KeyboardInterrupt: `stop` said so."""
+        """Run a scene until it ends or stops; InputError: it cannot be run; KeyboardInterrupt: `stop` returned True."""
         particles = sample_bodies(scene)
         backend = self._choose(scene)
         if _keeps(scene, particles, backend):
@@ -132,7 +133,7 @@ class Runner:
         return record(run, scene, backend, stop)
 
     def run_all(self, scenes: Sequence[Scene]) -> Iterator[tuple[int, Recording | Exception]]:
-        """Yield the place of each scene with its recording or error, as they end; on a GPU small ones run at once."""
+        """Yield the index of each scene with its recording or error, as they end; small ones run together on a GPU."""
         alone: list[int] = []
         kinds: list[tuple[CompiledKind, list[int]]] = []
         sampled: dict[int, list[BodyParticles]] = {}
@@ -193,7 +194,7 @@ class Runner:
         self._backend = start(backend)
 
     def _batch_for(self, kind: CompiledKind, backend: Backend, runs: int = 1) -> Batch:
-        """Return a batch with room for so many runs of this kind."""
+        """Return a batch for the given number of runs of this kind."""
         if self._backend != backend:
             self._restart(backend)
         wanted = kind
@@ -209,7 +210,7 @@ class Runner:
 
 
 def _keeps(scene: Scene, particles: Sequence[BodyParticles], backend: Backend) -> bool:
-    """Return whether a scene with these particles is computed by kernels that are kept for others."""
+    """Return whether a scene with these particles uses kernels that are kept for others."""
     count = sum(len(body.position) for body in particles)
     if wants_sparse(scene) and backend.on_cpu:
         return False

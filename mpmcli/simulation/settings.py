@@ -1,4 +1,4 @@
-"""Settings of a run that are not part of its scene, and why it ends before its end."""
+"""Settings of a run that are not part of its scene, and the conditions that end it early."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -13,14 +13,14 @@ from mpmcli.plain_text import size_text
 from mpmcli.solver.machine.backend import Arch
 from mpmcli.solver.machine.plan import Plan
 
-# Time kept for the last records and the end of the process, s, and multiple of the longest pause between two questions
-# that is kept for the next one.
+# Time reserved for the last records and the end of the process, s; and time reserved for the next check, as a multiple
+# of the longest interval between two checks.
 RESERVE, PAUSES = 2.0, 1.5
-# Packing reads, writes and compares what was written once; bytes/s of compression.
+# Packing reads, writes and compares the data once each; bytes/s of compression.
 PACKING, COMPRESSION = 3.0, 30e6
 # Wall time that packing may take after a signal, s.
 PACKING_LEFT = 1.5
-# Time between two looks at the memory, s.
+# Time between two measurements of the memory, s.
 MEMORY_LOOKS = 0.1
 
 
@@ -32,7 +32,7 @@ class Limits:
     max_memory: int | None = None
 
     def require_memory(self, plan: Plan) -> None:
-        """Raise InputError where a plan and what the process takes now need more memory than the limit."""
+        """Raise an InputError if a plan, in addition to the memory in use, exceeds the limit."""
         if self.max_memory is None:
             return
         need = resident_bytes() + plan.machine_bytes
@@ -44,10 +44,10 @@ class Limits:
 
 
 class StopCondition:
-    """Answers whether to end a run: "interrupted" by `signal`, or "stopped" at a limit, and why in `message`."""
+    """Decides whether to end a run: "interrupted" by `signal`, or "stopped" at a limit; `message` has the reason."""
 
     def __init__(self, stop: Callable[[], bool | str], limits: Limits, *, compress: bool = False) -> None:
-        """Begin; `stop` tells whether to interrupt the run, or the signal that asks for it."""
+        """Begin; `stop` returns whether to interrupt the run, or the name of the requesting signal."""
         self._stop, self._limits, self._compress = stop, limits, compress
         self._end = None if limits.max_time is None else limits.max_time + _process_began()
         self._asked: float | None = None
@@ -58,7 +58,7 @@ class StopCondition:
         self.message = self.signal = ""
 
     def wrote(self, size: int, seconds: float) -> None:
-        """Take note of what has been sealed so far, bytes, and the wall time that it took, s."""
+        """Record the bytes sealed so far, and the wall time spent on them, s."""
         self._written, self._seconds = size, seconds
 
     def __call__(self) -> bool:
@@ -84,7 +84,7 @@ class StopCondition:
         return self._end is not None and time.monotonic() > self._end - RESERVE
 
     def interrupted(self) -> None:
-        """Take note of a KeyboardInterrupt that came by itself, if there is no other reason."""
+        """Record a KeyboardInterrupt that no signal announced, if there is no other reason."""
         if not self._ask_signal() and not self.status:
             self.status, self.message = "interrupted", "the run was interrupted"
             self._asked = time.monotonic()
@@ -115,12 +115,12 @@ class StopCondition:
 
 
 def resident_bytes() -> int:
-    """Return the memory that this process has in use, bytes."""
+    """Return the resident memory of this process, bytes."""
     return psutil.Process().memory_info().rss
 
 
 def _process_began() -> float:
-    """Return when this process began, in the time of `time.monotonic`, s."""
+    """Return the start of this process in the time of `time.monotonic`, s."""
     age = time.time() - psutil.Process().create_time()
     # The clock may have been set since.
     return time.monotonic() - min(max(age, 0.0), 60.0)
@@ -135,9 +135,9 @@ def _clock(seconds: float) -> str:
 class RunSettings:
     """Settings of a run that are not part of its scene.
 
-    Of `threads`, None is one for few particles and otherwise all. `checkpoint_every` is in s, None for as often as
-    costs less than 1 %. `force` runs although the check finds errors, and takes time.step above the stable step;
-    `compile_cache` keeps compiled kernels for the next start; `command` is the command line, for the record.
+    `threads` None means one for few particles, else all. `checkpoint_every` is in s, None for the rate that costs less
+    than 1 %. `force` runs despite errors of the check, and permits time.step above the stable step; `compile_cache`
+    keeps compiled kernels for the next start; `command` is the command line for the record.
     """
 
     directory: Path

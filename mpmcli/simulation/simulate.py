@@ -1,4 +1,4 @@
-"""One run from a loaded scene to a stored result: check, refuse or go on, run, store."""
+"""One run from a loaded scene to a stored result: check, resume, run, store."""
 
 import time
 from collections.abc import Callable, Iterable
@@ -42,21 +42,21 @@ def simulate(
     on_frame: Callable[[LedgerRow, RunSummary], None] = lambda row, summary: None,
     stop: Callable[[], bool | str] = lambda: False,
 ) -> RunSummary:
-    """Check a scene, run it to its end or to where it stops, and store it.
+    """Check a scene, run it until it ends or stops, and store the result.
 
-    Everything that can be refused is refused before anything is written. A run that becomes unstable, is
-    interrupted (`stop`, or KeyboardInterrupt), comes near a limit or cannot write keeps its sealed frames; its summary
-    says so. One that is interrupted before its first frame leaves nothing.
+    All input is validated before anything is written. A run that becomes unstable, is interrupted (`stop`, or
+    KeyboardInterrupt), approaches a limit or cannot write keeps its sealed frames; its summary has the reason. A run
+    interrupted before its first frame leaves no files.
 
     Args:
         on_start: called before the first step, with the notes and warnings of the check in the summary.
         on_frame: called after each stored frame with its ledger row and the summary so far.
         stop: called after every step and every stored frame; returns whether to interrupt the run, or the name of the
-            signal that asks for it.
+            requesting signal.
 
     Raises:
-        InputError: the check finds errors, or the scene, the backend or the directory cannot be used, as when another
-            process writes it; nothing was written.
+        InputError: the check finds errors, or the scene, the backend or the directory cannot be used, for example
+            because another process writes to it; nothing was written.
         KeyboardInterrupt: the run was interrupted before it began; nothing was written.
     """
     began = time.perf_counter()
@@ -73,10 +73,10 @@ def simulate(
     run = None if complete else _build(scene, settings, plan, backend)
     if stop():
         raise KeyboardInterrupt
-    # Last, since it removes an earlier result.
+    # Last, because it removes an earlier result.
     with take_directory(settings.directory, settings.overwrite, resume=settings.resume) as taken:
         if settings.resume:
-            # Once more, as nobody else can write now.
+            # Checked again under the lock, which excludes other writers.
             earlier = find_resumption(loaded, settings.directory)
             if run is None and (earlier is None or not earlier.complete):
                 raise InputError(
@@ -152,7 +152,7 @@ def _store_run(
         summary.status, summary.message = "failed", out_of_memory_sentence(context.backend.arch, error)
     finally:
         if summary.status == "running":
-            # A fault of mpmcli: the record must not state that the run is going on.
+            # A fault of mpmcli: the record must not state that the run continues.
             record.close("failed", "an internal error ended the run")
     summary.steps = run.step_count
     clock.book(run.first_step_seconds, "compile_s")
@@ -170,7 +170,7 @@ def _store_run(
 def _complete(
     context: RunContext, on_start: Callable[[RunSummary], None], stop: Callable[[], bool | str]
 ) -> RunSummary:
-    """Pack the frames of a run that had stored all of them; nothing is done where they are packed."""
+    """Pack the frames of a run that has stored all of them, unless they are packed."""
     settings, earlier, directory = context.settings, context.earlier, context.directory
     summary = new_summary(context)
     on_start(summary)
@@ -208,7 +208,7 @@ def _compute(
     on_frame: Callable[[LedgerRow, RunSummary], None],
     halt: StopCondition,
 ) -> None:
-    """Compute and store frame after frame; the record and the summary follow the frames that are sealed."""
+    """Compute and store each frame; the record and the summary count only sealed frames."""
     rows: list[LedgerRow] = []
     kept = store.frames_written
 
@@ -250,12 +250,12 @@ def _compute(
                 rows.append(row)
             with clock.adding("output_s"):
                 store.write(frame, row)
-            # The next one is made of memory that this one gives back.
+            # Release the frame, whose memory the next one reuses.
             del frame
             report()
             halt.wrote(store.bytes_written, store.seconds)
     except BaseException:
-        # The first error is the one to be told.
+        # Report the first error.
         with suppress(RunError):
             store.seal()
             report()
@@ -263,13 +263,13 @@ def _compute(
     with clock.adding("output_s"):
         store.seal()
         if checkpoints.taken:
-            # So that the run can go on where its end is put off.
+            # A final checkpoint permits resumption with a later end.
             checkpoints.take()
     report()
 
 
 def _refusal(source: str, findings: Iterable[Finding]) -> str:
-    """Return the message of a scene that the check refuses, a line for each error."""
+    """Return the message for a scene refused by the check, a line per error."""
     errors = [finding for finding in findings if finding.severity == "error"]
     lines = [f"{source}: {finding.what} {finding.fix}" for finding in errors]
     # A run that does not fit into memory cannot be forced.

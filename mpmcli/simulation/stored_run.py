@@ -1,4 +1,4 @@
-"""What a run stores: the record, the scene, the frames, checkpoints."""
+"""Creates and completes the files of a run: record, scene, frames and checkpoints."""
 
 import time
 from collections.abc import Mapping
@@ -25,12 +25,11 @@ from mpmcli.solver.machine.plan import Plan
 
 
 class RunContext(NamedTuple):
-    """What a run is begun with.
+    """The inputs of a run.
 
     Attributes:
-        began: when, as of `time.perf_counter`, s; earlier: the part that it goes on from.
-        notes: what was chosen for the user, and warnings of the check.
-        taken: the directory, which no other process writes.
+        began: start in the time of `time.perf_counter`, s; earlier: the resumed part. notes: automatic choices, and
+            warnings of the check. taken: the directory, locked against other processes.
     """
 
     loaded: LoadedScene
@@ -50,23 +49,23 @@ class RunContext(NamedTuple):
 
     @property
     def directory(self) -> Path:
-        """Where the result goes."""
+        """The output directory."""
         return self.settings.directory
 
     @property
     def forced(self) -> bool:
-        """Whether time.step is taken above the stable step, too."""
+        """Whether time.step is used even above the stable step."""
         return self.settings.force and self.scene.time.step != "auto"
 
     @property
     def facts(self) -> dict[str, object]:
-        """The backend, as a header states it."""
+        """The backend, as in a header."""
         backend = self.backend
         return {"arch": backend.arch, "threads": backend.threads, "precision": backend.precision}
 
 
 def new_summary(context: RunContext) -> RunSummary:
-    """Return the summary of a run that begins, or goes on from an earlier part."""
+    """Return the summary of a new or resumed run."""
     plan, earlier = context.plan, context.earlier
     expected = context.scene.time.frames + 1
     summary = RunSummary(context.directory, plan.particles, expected, context.facts, context.notes, plan)
@@ -81,7 +80,7 @@ def new_summary(context: RunContext) -> RunSummary:
 
 
 def new_store(context: RunContext, header: dict[str, Any]) -> SegmentStore:
-    """Return the store of a run, which goes on after the frames that are there."""
+    """Return the store of a run, which continues after the existing frames."""
     scene, earlier = context.scene, context.earlier
     compress, colliders = scene.output.compress, scene.colliders
     store = SegmentStore(context.directory, header, compress=compress, hold=HOLD, colliders=colliders)
@@ -91,7 +90,7 @@ def new_store(context: RunContext, header: dict[str, Any]) -> SegmentStore:
 
 
 def write_scene(directory: Path, text: str) -> None:
-    """Write the effective scene beside the frames; RunError: the disk is full or refuses."""
+    """Write the effective scene to the output directory; RunError: the disk is full or a write failed."""
     try:
         write_text(directory / SCENE, text)
     except OSError as error:
@@ -99,9 +98,9 @@ def write_scene(directory: Path, text: str) -> None:
 
 
 def finish(context: RunContext, store: SegmentStore, summary: RunSummary, halt: StopCondition) -> None:
-    """Pack what was stored, and write it as a series too, if that is asked for.
+    """Pack the stored frames, and also write them as a series if requested.
 
-    Until then, the result is the directory with its sealed frames.
+    Before that, the result is the directory with its sealed frames.
     """
     summary.path = summary.directory
     try:
@@ -124,7 +123,7 @@ def finish(context: RunContext, store: SegmentStore, summary: RunSummary, halt: 
 
 
 def new_record(context: RunContext, summary: RunSummary) -> RunRecord:
-    """Return the record of a run, which goes on from that of an earlier part."""
+    """Return the record of a run, continued from that of an earlier part."""
     earlier = context.earlier
     record = RunRecord(
         context.directory,
@@ -142,14 +141,14 @@ def new_record(context: RunContext, summary: RunSummary) -> RunRecord:
     return record
 
 
-# Share of the wall time that checkpoints may take, and the least time between two, s.
+# Fraction of the wall time that checkpoints may take, and the shortest time between two, s.
 SHARE, LEAST = 0.008, 5.0
-# Before the first one: seconds to compile what reads the device, and bytes written in a second.
+# Cost assumed before the first one: seconds to compile the kernels that read the device, and bytes written per second.
 FIRST, RATE = 1.0, 3e8
 
 
 class Checkpointer:
-    """Takes checkpoints of one run; `seconds` of wall time spent so far, and number `taken`."""
+    """Writes checkpoints of one run; `seconds` of wall time spent so far, and number `taken`."""
 
     def __init__(
         self,
@@ -162,7 +161,7 @@ class Checkpointer:
         forced: bool,
         every: float | None = None,
     ) -> None:
-        """Begin; `size` is of the particles, bytes, `every` s between two, None: at a cost of SHARE of the time."""
+        """Begin; `size` of the particles, bytes; `every` in s, None: as often as costs SHARE of the time."""
         self._directory, self._run, self._store = directory, run, store
         self._backend = {name: str(backend[name]) for name in ("arch", "precision")}
         self._forced, self._every = forced, every
@@ -171,12 +170,12 @@ class Checkpointer:
         self.seconds, self.taken = 0.0, 0
 
     def due(self) -> bool:
-        """Return whether the next one is."""
+        """Return whether the next checkpoint is due."""
         wait = max(LEAST, self._cost / SHARE) if self._every is None else self._every
         return time.monotonic() - self._last >= wait
 
     def take(self) -> None:
-        """Seal waiting frames, else RunError, and then the state; where the disk is full, go on without."""
+        """Seal waiting frames, then write the state; RunError: frames cannot be sealed. A full disk skips the state."""
         began = time.monotonic()
         self._store.seal()
         sealed = time.monotonic()

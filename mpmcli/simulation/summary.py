@@ -1,4 +1,4 @@
-"""How a run went: its status, counts, first and last ledger rows, and where its time went."""
+"""Summary of a run: status, counts, first and last ledger rows, and timings."""
 
 import time
 from dataclasses import dataclass, field
@@ -10,17 +10,17 @@ from mpmcli.solver.machine.plan import Plan
 
 @dataclass
 class RunSummary:
-    """How a run went.
+    """Summary of a run.
 
     Attributes:
-        directory: where the result is; path: the file to open, None where no frame was written.
-        status: "finished", "unstable", "interrupted" by a signal, "stopped" at a limit or for want of room, "failed".
-        message: why it ended early, "" where it did not.
-        time: simulated so far, s. frames, steps, particles: counts; frames_expected: of the whole run; steps_before:
-            those of earlier processes, where the run was resumed.
+        directory: the output directory; path: the file to open, None if no frame was written.
+        status: "finished", "unstable", "interrupted" by a signal, "stopped" at a limit or for lack of space, "failed".
+        message: reason of an early end, else "".
+        time: simulated so far, s. frames, steps, particles: counts; frames_expected: frames of the whole run;
+            steps_before: steps of earlier processes of a resumed run.
         backend: "arch", "threads" and "precision"; plan: memory and passes.
-        notes: what was chosen for the user, and warnings of the check.
-        outlook: the forecast of the check, a line; compiling: seconds of it to compile, None where not known.
+        notes: automatic choices, and warnings of the check. outlook: the forecast of the check, one line; compiling:
+            its seconds of compilation, None if unknown.
         timings: seconds by name: start_s (load and allocate), compile_s (first step, compilation
             included), solve_s (all further steps), watch_s (of these, measuring the state for the limits), output_s
             (frames and packing), wall_s.
@@ -53,7 +53,7 @@ class RunSummary:
         return self.particles * max(self.steps - self.steps_before - 1, 0) / seconds if seconds > 0 else 0.0
 
     def as_dict(self) -> dict:
-        """Return all of it as JSON can hold it."""
+        """Return it for JSON."""
         return {
             "status": self.status,
             "message": self.message,
@@ -72,7 +72,7 @@ class RunSummary:
         }
 
     def text(self) -> str:
-        """Return it as text for people: the status, where the time went, energy, volume and the file to open."""
+        """Return it as text: status, timings, energy, volume and the file to open."""
         times = self.timings
         rate = f", {self.rate / 1e6:.1f} M particle-steps/s" if self.rate else ""
         lines = [
@@ -96,19 +96,19 @@ class RunSummary:
 
 
 class Stopwatch:
-    """Adds up the wall time of parts of a run that `began`, in place, in the `timings` of a `RunSummary`."""
+    """Adds the wall time of parts of a run to the `timings` of a `RunSummary`, in place, since `began`."""
 
     def __init__(self, timings: dict[str, float], began: float) -> None:
         self._timings = timings
         self._began = began
         self._key = ""
-        # Entry and start of each with block that is under way, the innermost last.
+        # Entry and start of each active with block, the innermost last.
         self._open: list[tuple[str, float]] = []
         self._booked: dict[str, float] = {}
         timings.update(start_s=time.perf_counter() - began, compile_s=0.0, solve_s=0.0, output_s=0.0, wall_s=0.0)
 
     def adding(self, key: str) -> "Stopwatch":
-        """Add the time of a with block to an entry, and of a block in it to that block's entry alone."""
+        """Add the time of a with block to an entry, without nested blocks, which count for their own entries."""
         self._key = key
         return self
 
@@ -131,7 +131,7 @@ class Stopwatch:
             self._timings[key] += now - since
 
     def book(self, total: float, key: str) -> None:
-        """Move seconds that the solver has spent so far on something else from solve_s to another entry."""
+        """Move seconds that the solver has spent on another task from solve_s to that task's entry."""
         seconds = total - self._booked.get(key, 0.0)
         self._booked[key] = total
         self._timings["solve_s"] -= seconds

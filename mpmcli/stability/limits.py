@@ -20,7 +20,7 @@ WHY = {
     "speed": "a particle must not move more than half a cell in a step",
     "deformation": "a particle must not be compressed by more than half in a step",
     "collider": "a collider must not move more than half a cell in a step",
-    "force": "a force must not change by itself within a step, as the particle that it pushes moves on",
+    "force": "a force on a moving particle must not change by its own size within a step",
     "maximum": "time.step in the scene sets it",
     "forced": "time.step in the scene sets it, above what is stable, as --force allows",
 }
@@ -41,7 +41,7 @@ class Limit(NamedTuple):
 
     value: float  # the largest step that it allows, s
     name: str  # one of WHY
-    body: str  # name of the body that sets it, "" where no single one does
+    body: str  # name of the body that sets it, "" if no single one does
 
     @property
     def why(self) -> str:
@@ -57,16 +57,16 @@ class Limit(NamedTuple):
 def mode_limit(
     spacing: float, density: float, stiffness: float, viscosity: float = 0.0, inertia: float = 1.0
 ) -> tuple[float, str]:
-    """Return the step that one mode of an isolated particle allows, s, and which of the two binds.
+    """Return the step that one mode of an isolated particle allows, s, and the name of the binding term.
 
     With a = 4 dt / (h^2 density) its velocity gradient obeys C' = C - a tau, where tau = stiffness e + viscosity C,
     and then e' = e + dt C'. That is stable while dt^2 stiffness + 2 dt viscosity <= density h^2; at rest the
     stiffness, Pa, is d lambda + 2 mu for a solid and d K for a fluid, and the viscosity, Pa s, 2 density nu in shear,
     see `Mode`. The density, kg/m^3, is that at rest; `inertia` is a factor of density h^2 by the scheme, see
-    `transfer_factors.step_inertia`. What binds is "wave" or "viscosity", the larger of the two terms at that step.
+    `transfer_factors.step_inertia`. The binding term is "wave" or "viscosity", the larger of the two at that step.
     """
     inertia = inertia * density * spacing**2
-    # The root in the form that neither cancels nor overflows.
+    # The root in a form without cancellation or overflow.
     root = viscosity + math.sqrt(viscosity**2 + stiffness * inertia)
     if root == 0:
         return math.inf, "wave"
@@ -80,11 +80,11 @@ def speed_limit(spacing: float, speed: float, gravity: float) -> float:
 
 
 def crossing_step(spacing: float, speed: float, gravity: float, sqrt: Callable = math.sqrt) -> float:
-    """Return `speed_limit` where anything moves, s; kernels call it with numbers and a root of their own.
+    """Return `speed_limit` for a nonzero speed or gravity, s; kernels call it with their own numbers and root.
 
     It solves speed dt + gravity dt^2 = COURANT h: gravity adds to the speed before the particle moves.
     """
-    # The root in the form that neither cancels nor divides by zero.
+    # The root in a form without cancellation or division by zero.
     return 2 * COURANT * spacing / (speed + sqrt(speed * speed + 4 * gravity * COURANT * spacing))
 
 
@@ -101,6 +101,6 @@ def collider_limit(spacing: float, speed: float) -> float:
 def force_limit(slope: float) -> float:
     """Return the step at which a force with the largest slope |da/dx| (1/s^2) stays smooth, s: dt^2 |da/dx| <= 1.
 
-    Leapfrog is stable up to 4 in a force that pulls back, a = -k x.
+    For a restoring force, a = -k x, leapfrog is stable up to 4.
     """
     return 1 / math.sqrt(slope) if slope > 0 else math.inf

@@ -14,14 +14,14 @@ APIC_LOSS = {"quadratic": 0.024, "cubic": 0.047}
 
 # Steps from one relaxation of volumes, and one shift of particles, to the next (docs/theory.md, 5.11 and 5.12).
 INTERVAL = 50
-# Longest way of a particle in a shift, and back, in distances of fine nodes.
+# Largest displacement of a particle in a shift, and back, in distances of fine nodes.
 FARTHEST = 0.2
 
-# Of an impact, measured on bars of 8 to 64 cells at 0.0005 to 0.1 of their wave speed, in pairs and on walls
+# Loss of an impact, measured on bars of 8 to 64 cells at 0.0005 to 0.1 of their wave speed, in pairs and on walls
 # (docs/theory.md, 2.5): -ln(1 - loss) = IMPACT_LOSS sqrt(min(1 / M, n / SLOW)) / (n C) in n cells, at the Mach number M
 # of a bar and the Courant number C of a step.
 IMPACT_LOSS, SLOW = 0.165, 1 / 14
-# The least that AFLIP leaves of it.
+# Smallest fraction of it that remains with AFLIP.
 IMPACT_OF_AFLIP = 0.12
 # The same exponent times n where bodies meet by their surfaces, whatever the speed, the step and the transfer.
 IMPACT_OF_SURFACES = 1.6
@@ -33,7 +33,7 @@ def affine_moment(settings: SolverSettings) -> float:
 
 
 def step_inertia(settings: SolverSettings) -> float:
-    """Return the inertia that a particle's stiffness works against, over that of APIC with quadratic splines.
+    """Return the inertia that opposes a particle's stiffness, over that of APIC with quadratic splines.
 
     A lone particle obeys C' = C - a tau with a = dt / (D density), tau = S e + V C and e' = e + dt C', which is stable
     while dt^2 S + 2 dt V <= 4 D density. AFLIP has the bound of APIC (docs/theory.md, 6.1).
@@ -42,11 +42,11 @@ def step_inertia(settings: SolverSettings) -> float:
 
 
 def loss_per_step(settings: SolverSettings, kh: float) -> float:
-    """Return the share of its energy that an elastic wave loses in a step, at wave number times spacing kh.
+    """Return the fraction of its energy that an elastic wave loses in a step, at wave number times spacing kh.
 
-    AFLIP loses 1 - flip of what APIC loses (docs/theory.md, 2.4).
+    AFLIP loses 1 - flip times the loss of APIC (docs/theory.md, 2.4).
     """
-    # Products overflow to infinity, where powers raise an error.
+    # Products overflow to infinity; powers raise an error.
     square = kh * kh
     return (1 - (settings.flip or 0.0)) * APIC_LOSS[settings.kernel] * square * square
 
