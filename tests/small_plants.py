@@ -227,6 +227,6 @@ CONTACT = _of(
     # Mean normals, which tilt beside edges; no separating axis; the places of particles in place of their surface.
     ("normal[b] = axes[0, b] + axes[1, b]", "normal[b] = 1.0 * normal[b]", "slope_contact"),
     ("if alike < SAME:", "if alike < -SAME:", "rolling_contact slope_contact"),
-    ("way -= depth * n", "way -= 0.0 * depth * n", "two_disks_contact"),
+    ("way[b] -= depth * n[b]", "way[b] -= 0.0 * depth * n[b]", "two_disks_contact"),
 )
 SMALL_PLANTS = (*TRANSFERS, *DRIVES, *WALLS, *CONTACT, *ELASTIC, *FLUIDS, *PLASTIC)
