@@ -186,10 +186,10 @@ def _impact(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
     now = lost(scene.solver, h)
     if not now >= NOTED_SHARE:
         return
+    takers = "contact and the transfers" if surfaces else f"the transfers, at steps of {courant * h / waves:.3g} s"
     what = (
         f'In its impact at {speed:.3g} m/s, {mach:.2g} times its wave speed, body "{body.name}", '
-        f"{length / h:.3g} cells long, loses about {_percent(now)} of the energy to the transfers, at steps of "
-        f"{courant * h / waves:.3g} s."
+        f"{length / h:.3g} cells long, loses about {_percent(now)} of the energy to {takers}."
     )
     fix = _cure(facts, lost(scene.solver, h / 2), None if surfaces else lost(_aflip(scene.solver), h))
     yield Finding("note", "impact-loss", what, fix, now, body.name)

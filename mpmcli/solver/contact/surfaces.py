@@ -211,7 +211,7 @@ class BodySurfaces:
             next one.
         end: of each tile, the particle after the last one that may show something.
         counted, rank, slots, reserved: on a GPU, of each bin how many it has; of each particle how many its bin had
-            before it; the particles bin by bin; and how many of these a run has.
+            before it; places of the particles, bin by bin; and how many of these a run has reserved.
         shown: of each particle its layer, or HIDDEN; surface: the normal n of its body, the depth d below it, m,
             and dv/dn, 1/s.
     """
@@ -277,7 +277,7 @@ class BodySurfaces:
 
     @ti.func
     def find_box(self, grid: ti.template(), obstacles: ti.template(), w: int, drift: int, last: ti.template()):
-        """Find the nodes that layers use, and those where they may meet, `drift` cells after the sort.
+        """Find the nodes that layers use, and those where they may meet, `drift` cells after the sort; free all places.
 
         Among these are the nodes at which the stencils begin of what meets there.
         """

@@ -381,8 +381,7 @@ class CpuPhases(RunPhases):
                 (inner,) = ti.static((at.in_layer(layer, own),))
                 clear_rows(inner.grid, first, after)
             if ti.static(self.separates):
-                box = self.near_bodies(at)
-                (near,) = ti.static((at.grid.within(box),))
+                (near,) = ti.static(self.near_bodies(at))
                 first, after = self.rows_near_bodies(near, at)
                 self.device.contact.surfaces.clear_rows(near, at.w, first, after)
 
@@ -531,16 +530,15 @@ class CpuPhases(RunPhases):
     @ti.func
     def find_bodies(self, at: ti.template()):
         """Find where two bodies meet."""
-        box = self.near_bodies(at)
-        grid, obstacles = ti.static((at.grid.within(box), at.obstacles()))
+        (grid,) = ti.static(self.near_bodies(at))
+        (obstacles,) = ti.static((at.obstacles(),))
         first, after = self.rows_near_bodies(grid, at)
         self.device.contact.surfaces.find_rows(grid, obstacles, at.w, first, after)
 
     @ti.func
     def show_surface(self, at: ti.template()):
         """Find what particles of the g-th group show."""
-        box = self.near_bodies(at)
-        (grid,) = ti.static((at.grid.within(box),))
+        (grid,) = ti.static(self.near_bodies(at))
         first, after = self.places.even_part(self.device.contact.surfaces.tile_count(grid, at.w), at.region)
         first, after = self.share(first, after, at.part)
         for q in range(first, after):
@@ -550,8 +548,7 @@ class CpuPhases(RunPhases):
     def link_surfaces(self, at: ti.template()):
         """Put what particles show into the bins of their nodes, on one thread, in their order."""
         if at.region == 0 and at.part == 0:
-            box = self.near_bodies(at)
-            (grid,) = ti.static((at.grid.within(box),))
+            (grid,) = ti.static(self.near_bodies(at))
             for q in range(self.device.contact.surfaces.tile_count(grid, at.w)):
                 for g in ti.static(self.device.contact.surfaces.surfaced):
                     self.device.contact.surfaces.link(g, grid, at.w, q)
@@ -559,8 +556,9 @@ class CpuPhases(RunPhases):
     @ti.func
     def exchange(self, at: ti.template()):
         """Let bodies that meet at nodes exchange momentum, and walls and colliders push them."""
-        box, gravity_step = self.near_bodies(at), self.gravity_of(at.step)
-        grid, obstacles = ti.static((at.grid.within(box), at.obstacles()))
+        (grid,) = ti.static(self.near_bodies(at))
+        (obstacles,) = ti.static((at.obstacles(),))
+        gravity_step = self.gravity_of(at.step)
         first, after = self.rows_near_bodies(grid, at)
         thread = at.w * ti.static(self.regions) + at.t
         self.device.contact.exchange_rows(grid, obstacles, at.w, thread, first, after, at.step.dt, gravity_step)

@@ -276,11 +276,11 @@ class RunPhases:
 
     @ti.func
     def near_bodies(self, at: ti.template()):
-        """Return the box of the nodes where bodies may meet, as `Grid.box`."""
+        """Return the view of the grid in which only nodes where bodies may meet are in use, a tuple."""
         box = ti.Matrix.zero(int, 2, self.dimension)
         for i, a in ti.static(ti.ndrange(2, self.dimension)):
             box[i, a] = self.device.contact.surfaces.box[at.w * 2 + i, a]
-        return box
+        return ti.static((at.grid.within(box),))
 
     @ti.func
     def forget_extremes(self, step: ti.template()):

@@ -223,16 +223,15 @@ class GpuPhases(RunPhases):
     @ti.func
     def find_bodies(self, at: ti.template()):
         """Find which bodies are at a node, and whether they meet anything."""
-        box = self.near_bodies(at)
-        grid, obstacles = ti.static((at.grid.within(box), at.obstacles()))
+        (grid,) = ti.static(self.near_bodies(at))
+        (obstacles,) = ti.static((at.obstacles(),))
         if at.q < grid.box_nodes():
             self.device.contact.surfaces.find(grid, obstacles, at.w, grid.box_node(at.q))
 
     @ti.func
     def show_surface(self, at: ti.template()):
         """Find what a particle shows."""
-        box = self.near_bodies(at)
-        (grid,) = ti.static((at.grid.within(box),))
+        (grid,) = ti.static(self.near_bodies(at))
         self.device.contact.surfaces.count_particle(at.g, grid, at.w, at.q)
 
     @ti.func
@@ -243,8 +242,7 @@ class GpuPhases(RunPhases):
     @ti.func
     def put(self, at: ti.template()):
         """Put a particle into its place."""
-        box = self.near_bodies(at)
-        (grid,) = ti.static((at.grid.within(box),))
+        (grid,) = ti.static(self.near_bodies(at))
         self.device.contact.surfaces.put(at.g, grid, at.w, at.q)
 
     @ti.func
@@ -255,8 +253,7 @@ class GpuPhases(RunPhases):
     @ti.func
     def at_bins(self, at: ti.template(), do: ti.template()):
         """Do something with the bins of a node where bodies may meet."""
-        box = self.near_bodies(at)
-        (grid,) = ti.static((at.grid.within(box),))
+        (grid,) = ti.static(self.near_bodies(at))
         if at.q < grid.box_nodes():
             place = self.device.contact.surfaces.place_of(grid, at.w, grid.linear_index(grid.box_node(at.q)))
             ti.static(do)(at.w, place)
@@ -264,20 +261,13 @@ class GpuPhases(RunPhases):
     @ti.func
     def exchange(self, at: ti.template()):
         """Let bodies exchange momentum at some nodes, and walls and colliders push them."""
-        box, gravity_step, q = self.near_bodies(at), self.gravity_of(at.step), at.q
-        grid, obstacles, threads = ti.static((at.grid.within(box), at.obstacles(), self.device.contact.threads))
+        (grid,) = ti.static(self.near_bodies(at))
+        obstacles, threads = ti.static((at.obstacles(), self.device.contact.threads))
+        gravity_step, q = self.gravity_of(at.step), at.q
         while q < grid.box_nodes():
             node = grid.box_node(q)
-            self.device.contact.exchange_all(
-                grid,
-                obstacles,
-                at.w,
-                at.w * threads + at.q,
-                node,
-                grid.linear_index(node),
-                at.step.dt,
-                gravity_step,
-            )
+            index, thread = grid.linear_index(node), at.w * threads + at.q
+            self.device.contact.exchange_all(grid, obstacles, at.w, thread, node, index, at.step.dt, gravity_step)
             q += threads
 
     # What is done beside the steps.
