@@ -41,12 +41,12 @@ def near(surface: Surface, node: np.ndarray, h: float) -> np.ndarray:
     """Return the weights (n) of the particles whose stencil has a node and that show something."""
     away = (node - surface.x) / h
     weights = np.array([np.prod([quadratic(u) for u in row]) for row in away])
-    return weights * (surface.depth < 1.5 * h)
+    return weights * (surface.depth < surface.distance)
 
 
 def distance_to(surface: Surface, weights: np.ndarray, node: np.ndarray, axis: np.ndarray, h: float) -> float:
     """Return the distance of a node from the points of a surface along its outward axis, m."""
-    shown = (weights > 0) & (surface.depth < surface.distance)
+    shown = weights > 0
     r = node - (surface.x + surface.depth[:, None] * surface.n)[shown]
     radius, beta = 3 * h, 12 / surface.distance
     along = r @ axis
@@ -64,7 +64,7 @@ def distance_from(r: np.ndarray, axis: np.ndarray, beta: float, h: float) -> flo
 
 def normal_along(surface: Surface, weights: np.ndarray, axis: np.ndarray) -> np.ndarray:
     """Return the mean normal of the points of a surface that look along an axis most."""
-    shown = (weights > 0) & (surface.depth < surface.distance)
+    shown = weights > 0
     n = surface.n[shown]
     return unit((weights[shown] * np.exp(16 * (n @ axis - 1))) @ n)
 
@@ -184,7 +184,7 @@ def stop(
 
 
 def shows(surface: Surface, weights: np.ndarray) -> bool:
-    return bool(((weights > 0) & (surface.depth < surface.distance)).any())
+    return bool((weights > 0).any())
 
 
 def beyond(r: float, density: Callable[[float], float]) -> float:

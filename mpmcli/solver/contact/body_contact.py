@@ -47,9 +47,9 @@ LARGEST, SMALLEST = 80.0, 1e-37
 APART = 9.0
 # Threads of a GPU that work at nodes of all runs, as each needs memory for surface points, and the fewest of a run.
 GPU_THREADS, LEAST_THREADS = 4096, 64
-# Numbers of a layer: P-wave modulus, Pa, sharpness, 1/m, factor of a sum over a flat surface, distance of particles, m,
-# density, kg/m^3, and from FRICTION on the coefficient of friction with each layer, `STICKS` for one that sticks.
-MODULUS, SHARPNESS, FLAT, DISTANCE, DENSITY, FRICTION = range(6)
+# Numbers of a layer: P-wave modulus, Pa, sharpness, 1/m, factor of a sum over a flat surface, density, kg/m^3, and from
+# FRICTION on the coefficient of friction with each layer, `STICKS` for one that sticks.
+MODULUS, SHARPNESS, FLAT, DENSITY, FRICTION = range(5)
 # Of `LedgerRow`, see `BodyContact.extremes`.
 EXTREMES = ("contact_overlap", "contact_gap")
 
@@ -106,7 +106,8 @@ class BodyContact:
                 beta = SHARP / distance
                 width = math.sqrt(2 * math.pi * BALL * h / beta) / distance
                 modulus = material.lame_lambda + 2 * material.shear_modulus
-                rows[layer] = [modulus, beta, width ** (1 - self.dimension), distance, material.density]
+                rows[layer] = [modulus, beta, width ** (1 - self.dimension), material.density]
+                self.surfaces.band[run * self.layers + layer] = distance
         for layer, row in enumerate(np.hstack([rows, layers.frictions(scene)])):
             for k, number in enumerate(row):
                 self.rows[run * self.layers + layer, k] = number
@@ -397,8 +398,7 @@ class BodyContact:
                             for b in ti.static(range(d)):
                                 slopes[side, b] += weight * self.surfaces.surface[g][p][d + 1 + b]
                             depth = self.surfaces.surface[g][p][d]
-                            near = depth < self.rows[w * self.layers + layer, DISTANCE]
-                            if near and counts[side] < self.capacity:
+                            if counts[side] < self.capacity:
                                 at = (2 * thread + side) * self.share + counts[side]
                                 for b in ti.static(range(d)):
                                     # Entry by entry: Taichi may lose vectors that are assigned as a whole.

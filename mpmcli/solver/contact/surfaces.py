@@ -156,8 +156,6 @@ def place_of(node: ti.template(), spacing: float):
     return ti.cast(node - PAD, float) * spacing
 
 
-# Depth below a surface up to which particles count for its normal, cells.
-BAND = 1.5
 # Stretch of the smallest principal axis, inverse, up to which particles are found.
 CRUSHED = 4.0
 # In place of the first particle of a bin: none yet, or none ever. In place of a particle's layer: it shows nothing.
@@ -203,6 +201,7 @@ class BodySurfaces:
         used: of each of them, the nodes in use, as `Grid.box`; box: of each run, those where layers meet each other
             or an obstacle.
         drift: of each run, cells that particles may have moved since the sort.
+        band: of each layer of each run, the depth below its surface up to which particles show it, m.
         present: of each node of a run in that box the layers that have mass there, increased by 1, a byte each.
         met: of each of these nodes 1 where two bodies with layers of their own are, and 2 more where an obstacle is in
             reach of one.
@@ -235,6 +234,7 @@ class BodySurfaces:
         self.used = ti.field(int, shape=(2 * count, d))
         self.box = ti.field(int, shape=(2 * runs, d))
         self.drift, self.count = ti.field(int, shape=runs), ti.field(int, shape=runs)
+        self.band = ti.field(float, shape=count)
         self.present = ti.field(ti.i64, shape=runs * grid.node_count)
         self.met = ti.field(int, shape=runs * grid.node_count)
         self.first, self.following, self.shown, self.surface, self.end = {}, {}, {}, {}, {}
@@ -524,9 +524,10 @@ class BodySurfaces:
         """Find what a particle of the g-th group shows."""
         d, group = ti.static((self.dimension, self.groups[g]))
         base, _ = grid.scheme.spline.stencil(group.x[p], grid.inverse_spacing)
-        shown = HIDDEN
+        shown, layer = HIDDEN, group.layer_of(p)
+        band = self.band[w * self.layers + layer]
         # What lies deeper at rest is farther from the surface than the band, unless it is crushed.
-        if group.carried[p][d] < CRUSHED * BAND * grid.spacing:
+        if group.carried[p][d] < CRUSHED * band:
             bin_ = self.bin_of(grid, w, base)
             if bin_ >= 0 and self.first[g][ti.max(bin_, 0)] != CLOSED:
                 N = ti.Vector.zero(float, d)
@@ -535,8 +536,8 @@ class BodySurfaces:
                 n = group.stored(p).inverse().transpose() @ N
                 size = n.norm()
                 depth = group.carried[p][d] / size
-                if depth < BAND * grid.spacing:
-                    shown = group.layer_of(p)
+                if depth < band:
+                    shown = layer
                     for c in ti.static(range(d)):
                         self.surface[g][p][c] = n[c] / size
                         slope = 0.0
