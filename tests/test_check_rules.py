@@ -122,6 +122,25 @@ def test_bodies_that_separate_begin_where_they_like() -> None:
     assert len(found("wall-margin", bodies[:1], **(separate | {"domain": sticks}))) == 1
 
 
+@pytest.mark.parametrize(
+    ("more", "fires"),
+    [
+        ({}, True),
+        ({"contact": {"default": "stick"}}, False),
+        ({"contact": {"default": "separate", "friction": 0.3}}, False),
+        ({"domain": {"walls": {"x_min": "periodic", "x_max": "periodic"}}}, False),
+        ({"solver": {"solids": "total"}}, False),
+    ],
+)
+def test_elastic_bodies_that_stick_because_nothing_was_said(more: dict, fires: bool) -> None:
+    """Of two elastic bodies, unless the scene says what their contact is, or cannot resolve it."""
+    low, high = block("low", [0.25, 0.0], [0.5, 0.25]), block("high", [0.25, 0.5], [0.5, 0.75])
+    elastic = [one | {"material": SOLID} for one in (low, high)]
+    assert [finding.severity for finding in found("contact", elastic, **more)] == ["note"] * fires
+    if fires:
+        assert not found("contact", [elastic[0], high | {"material": FLUID}])
+
+
 @pytest.mark.parametrize(("count", "severity"), [(1, "warning"), (3, "warning"), (4, None), (16, None), (17, "note")])
 def test_particles_per_cell(count: int, severity: str | None) -> None:
     """From 2^d to 4^d."""

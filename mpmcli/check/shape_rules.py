@@ -17,6 +17,7 @@ from mpmcli.scene import Scene
 from mpmcli.scene.bounds import body_points
 from mpmcli.scene.domain import PERIODIC
 from mpmcli.scene.primitives import grid_points
+from mpmcli.scene.problem import quoted, several
 from mpmcli.scene.quantity import AXES
 from mpmcli.scene.sampling import initial_deformation, initial_motion, moves_unevenly
 from mpmcli.scene.surface import form_surface, surface_points
@@ -48,7 +49,7 @@ POINTS, INSTANTS = {2: 96, 3: 32}, 33
 
 def shape_findings(facts: SceneFacts) -> Iterator[Finding]:
     """Yield the findings on shapes and their particles."""
-    for rule in (_thin, _gaps, _walls, _particles, _stretched):
+    for rule in (_thin, _gaps, _sticking, _walls, _particles, _stretched):
         yield from rule(facts)
 
 
@@ -84,6 +85,22 @@ def _gaps(facts: SceneFacts) -> Iterator[Finding]:
         )
         fix = f"Set them {reach * h:.3g} m apart, or make the spacing {distance / reach:.3g} m, to keep them apart."
         yield Finding("warning" if passing else "note", "gap", what, fix, cells, first.name)
+
+
+def _sticking(facts: SceneFacts) -> Iterator[Finding]:
+    """Yield elastic bodies that stick to each other because the scene does not say what their contact is."""
+    scene = facts.scene
+    elastic = [source.name for source in scene.sources if source.has_surface]
+    asked = scene.contact.pairs or "default" in scene.contact.model_fields_set
+    periodic = any(PERIODIC in pair for pair in scene.domain.walls.faces(scene.dimension))
+    if len(elastic) > 1 and not asked and not periodic and scene.solver.solids != "total":
+        reach = REACH[scene.solver.kernel]
+        what = (
+            f"The elastic bodies {several(quoted(elastic))} share one velocity field: they act on each other within "
+            f"{reach:g} cells, and do not slide on each other."
+        )
+        fix = 'Set contact.default = "separate" to resolve contact at their surfaces, or "stick" to keep this.'
+        yield Finding("note", "contact", what, fix, len(elastic), elastic[0])
 
 
 def _walls(facts: SceneFacts) -> Iterator[Finding]:
