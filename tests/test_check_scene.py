@@ -113,6 +113,22 @@ def test_a_dense_body_packs_snow_harder() -> None:
     assert packed[1] > 1.2 * packed[0]
 
 
+@pytest.mark.parametrize("speed", [1.0, 4.0])
+@pytest.mark.parametrize("shape", [{"ball": {"center": [0.5, 0.3], "radius": 0.15}}, box([0.3, 0.05], [0.7, 0.35])])
+def test_snow_that_hits_the_floor_keeps_the_step_that_is_safe(backend_of: Callable, shape: dict, speed: float) -> None:
+    """Its smallest step is that one, within the safety factor, and at most twice as long."""
+    snow = {"law": "snow", "density": 400.0}
+    scene = loaded(
+        material=snow,
+        shape=shape,
+        velocity=[0.0, -speed],
+        domain={"size": [1.0, 1.0], "cells": [48, 48], "gravity": [0.0, -9.81], "walls": "separate"},
+        time={"end": 0.3, "frames": 10},
+    )
+    steps = [row.step_min for _, row in build_run(scene.scene, backend_of("f32", 1)).frames()]
+    assert 0.8 < min(steps[1:]) / SceneFacts(scene.scene).step < 2
+
+
 @pytest.mark.parametrize(
     ("material", "velocity"),
     [(FLUID, 0.0), (FLUID | {"viscosity": 100.0}, 200.0), (SOLID, 200.0), ({"law": "snow", "density": 400.0}, 0.0)],

@@ -10,7 +10,7 @@ from law_tangent import largest_stiffness
 from pydantic import ValidationError
 
 from mpmcli.materials.law import StateBound
-from mpmcli.materials.snow import Snow, SnowParameters
+from mpmcli.materials.snow import FOCUS, Snow, SnowParameters
 from mpmcli.scene.material import SceneBounds
 
 PARAMETERS = SnowParameters(density=400.0)
@@ -224,7 +224,7 @@ def test_stiffest_state_follows_the_scene() -> None:
     assert PARAMETERS.hardness(packed(0.0, 5 * yields_at / (400 * 9.81))) == pytest.approx(5)
     assert packed(1e3, 0.0) == pytest.approx(PARAMETERS.plastic_range[0])
     J_P = packed(5.0, 0.0)
-    assert PARAMETERS.hardness(J_P) * yields_at == pytest.approx(400 * 25 / (1 - J_P))
+    assert PARAMETERS.hardness(J_P) * yields_at == pytest.approx(FOCUS * 400 * 25 / (1 - J_P))
     rest = max(mode.stiffness for mode in law.modes(PARAMETERS, StateBound()))
     bounds = SceneBounds(dimension=2, spacing=0.01, gravity=9.81, speed=1e3, height=0.0)
     hardest = max(mode.stiffness for mode in law.modes(PARAMETERS, law.stiffest(PARAMETERS, bounds)))
