@@ -228,6 +228,12 @@ def test_the_table_names_what_binds(tmp_path, monkeypatch) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+def test_bodies_with_equal_limits_share_a_row() -> None:
+    table = run_here("check", CONFIGS / "stack_2d.toml").stdout
+    assert len([line for line in table.splitlines() if line.startswith("block_1, block_2 and 4 more  wave ")]) == 2
+    assert "\nblock_3" not in table
+
+
 def test_strict_turns_warnings_into_errors(tmp_path) -> None:
     """Exit 0 with a warning, 1 with --strict, 1 with an error, 2 with bad input."""
     path = CONFIGS / "dam_break_2d.toml"

@@ -9,12 +9,14 @@ from mpmcli.check.facts import SceneFacts
 from mpmcli.check.finding import SEVERITIES, Finding, gravest_first, merged, passes
 from mpmcli.check.forecast import Forecast, Probe, forecast_of, output_findings
 from mpmcli.check.material_rules import material_findings
+from mpmcli.check.scene_limits import SceneLimit
 from mpmcli.check.shape_rules import drive_findings, shape_findings
 from mpmcli.check.step_rules import loss_findings, rounding_findings, step_findings
 from mpmcli.cores import available_cores
 from mpmcli.errors import InputError
 from mpmcli.plain_text import counted, size_text, text_table
 from mpmcli.scene import LoadedScene
+from mpmcli.scene.problem import several
 from mpmcli.solver.machine.backend import Backend
 from mpmcli.solver.machine.plan import Plan, make_plan, useful_threads
 
@@ -130,7 +132,7 @@ def check_scene(
 
 
 def _limits_text(facts: SceneFacts) -> str:
-    """Return one row for each bound, in the order of the scene; one row only if the stiffest state has the same."""
+    """Return one row for each bound, in the order of the scene; one for bodies, or states, that have the same."""
     at_rest = {(limit.name, limit.body): limit.value for limit in facts.limits if limit.state == "rest"}
     told = [
         limit
@@ -138,13 +140,15 @@ def _limits_text(facts: SceneFacts) -> str:
         if limit.state == "rest" or limit.value != at_rest.get((limit.name, limit.body)) or limit is facts.binding
     ]
     nearest = sorted(told, key=lambda limit: limit.value)[:MOST_ROWS]
-    rows = []
+    alike: dict[tuple[str, ...], list[SceneLimit]] = {}
     for limit in told:
         if limit in nearest:
-            marks = {"binds at the start": facts.binding_at_start, "binds throughout": facts.binding}
-            said = [word for word, binding in marks.items() if binding is limit]
-            mark = "binds" if len(said) == 2 else " ".join(said)
-            rows.append((limit.body or "any", limit.name, limit.meaning, f"{limit.value:.4g} s", mark))
+            alike.setdefault((limit.name, limit.meaning, f"{limit.value:.4g} s"), []).append(limit)
+    rows, marks = [], {"binds at the start": facts.binding_at_start, "binds throughout": facts.binding}
+    for cells, limits in alike.items():
+        said = [word for word, binding in marks.items() if binding in limits]
+        bodies = several([limit.body or "any" for limit in limits], 2)
+        rows.append((bodies, *cells, "binds" if len(said) == 2 else " ".join(said)))
     table = text_table(("body", "limit", "state", "largest step", ""), rows, left={0, 1, 2, 4})
     left_out = len(told) - len(nearest)
     return table + (f"\nand {left_out} that bind less" if left_out else "")
