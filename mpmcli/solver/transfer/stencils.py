@@ -115,8 +115,9 @@ def add(field: ti.template(), node: int, share: ti.template(), atomic: ti.templa
 
 @ti.func
 def gather_linear(field: ti.template(), grid: ti.template(), first: ti.template(), w: ti.template()):
-    """Return the weighted sums over a stencil of nodal values, and of values times their offset from the middle node,
-    cells.
+    """Return the weighted sums over a stencil of nodal values, and of values times their offset in cells.
+
+    Offsets are measured from the middle node.
     """
     d, width = ti.static((grid.dimension, field.n))
     origin = origin_of(first, grid)
