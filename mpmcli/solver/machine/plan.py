@@ -416,7 +416,7 @@ def _rough_axes(scene: Scene) -> list[int]:
 
 
 def _contact_bytes(scene: Scene, nodes: int, tile: int, tiles: Sequence[int], real: int) -> int:
-    """Return the bytes of data at walls: an integer per node of a separating plane, a vector per node of a rough one."""
+    """Return the bytes of data at walls: an integer per node of a separating plane, a vector per node with friction."""
     separating, rough = (
         [nodes // (tile * tiles[axis]) for axis in axes] for axes in (_separating_axes(scene), _rough_axes(scene))
     )
