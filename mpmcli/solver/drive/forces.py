@@ -388,8 +388,7 @@ class ExternalForces:
         """Measure forces at the current positions, from `time` until the next measurement, `ahead` s later.
 
         Returns:
-            The largest force per mass, m/s^2, and the largest row sum of its gradient |da/dx|, 1/s^2, including the
-                margin.
+            The largest force per mass, m/s^2, and the largest row sum of |da/dx|, 1/s^2, including the margin.
         """
         times = [time]
         if self._values.timed and ahead > 0:
