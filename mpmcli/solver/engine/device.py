@@ -338,7 +338,7 @@ class RunPhases:
 
     @ti.func
     def move_rigid(self, at: ti.template(), turn: ti.template()):
-        """Transfer momentum from nodes to rigid bodies (turn 0), resolve their contact (turn 1), or move them (turn 2)."""
+        """Transfer momentum from nodes to rigid bodies (turn 0), resolve their contact (1), or move them (2)."""
         if ti.static(turn == 0):
             at.nodes.rigid.take(at.w, at.run.dt)
         if ti.static(turn == 1):

@@ -280,7 +280,7 @@ class GpuPhases(RunPhases):
 
     @ti.func
     def average_for_frame(self, g: ti.template(), w: int, p: int, turn: ti.template()):
-        """Average volumes before a frame is read: clear the cell of a particle (turn 0), add it (1), take the mean (2)."""
+        """Average volumes before a frame: clear the cell of a particle (turn 0), add it (1), or take the mean (2)."""
         (run,) = ti.static((self.run(w),))
         (view,) = ti.static(self.see(run))
         if ti.static(turn == 0):
@@ -450,7 +450,7 @@ class GpuLaunch:
 
     @ti.kernel
     def step(self, part: ti.template()):
-        """Carry out one launch of a step of every advancing run; the first one begins the step, the last one ends it."""
+        """Carry out one launch of a step of all advancing runs; the first begins the step, the last ends it."""
         if ti.static(part in (SHIFT, FIRST)):
             for w in range(self.runs):
                 if ti.static(self.doubles):
