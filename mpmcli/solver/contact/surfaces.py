@@ -257,7 +257,7 @@ class BodySurfaces:
 
     @staticmethod
     def bytes_needed(nodes: int, tiles: int, particles: Sequence[int], surface: int, *, on_cpu: bool) -> int:
-        """Return the bytes for these nodes, tiles and particles per group, with `surface` bytes of data per particle."""
+        """Return the bytes for these nodes, tiles and particles per group; `surface` is the bytes per particle."""
         own = nodes * 12 + (nodes + tiles) * 4 * len(particles) + sum(particles) * (8 + surface)
         return own if on_cpu else own + 4 * nodes * len(particles) + 8 * sum(particles)
 
@@ -455,7 +455,7 @@ class BodySurfaces:
 
     @ti.func
     def stencil_before(self, grid: ti.template(), node: ti.template(), q: int):
-        """Return the offset from the first node of the stencil whose q-th node is `node`, and whether it is in the box."""
+        """XX"""
         n = ti.static(grid.scheme.spline.nodes)
         before, rest, inside = 0, q, True
         for b in ti.static(range(self.dimension)):

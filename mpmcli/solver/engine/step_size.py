@@ -75,7 +75,7 @@ class StepSize:
         drifts: bool,
         shift: float = 0.0,
     ) -> None:
-        """Store constants; `drifts` is whether particles move on the grid, `shift` the largest shift of a step, cells."""
+        """Store constants; `drifts` is whether particles move on the grid, `shift` the largest shift, cells."""
         self.drifts, self.shift = drifts, shift
         self.values = values
         self.groups, self.bodies, self.scheme = tuple(groups), layout.bodies, scheme
