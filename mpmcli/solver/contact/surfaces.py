@@ -455,7 +455,9 @@ class BodySurfaces:
 
     @ti.func
     def stencil_before(self, grid: ti.template(), node: ti.template(), q: int):
-        """XX"""
+        """Return the offset of a node from the start of the stencil in which it is q-th, and whether that is in the
+        box.
+        """
         n = ti.static(grid.scheme.spline.nodes)
         before, rest, inside = 0, q, True
         for b in ti.static(range(self.dimension)):

@@ -57,13 +57,13 @@ def _int(writer: str, start: float | None = 0, per: str = "") -> Entry:
 
 RUN: Mapping[str, Entry] = {
     # The scene.
-    "spacing": _real("scene"),  # of the grid, m
+    "spacing": _real("scene"),  # spacing of the grid, m
     "inverse_spacing": _real("scene"),  # 1/m
     "gradient_scale": _real("scene"),  # see `Grid`, 1/m
-    "extent": _real("scene", per="axis"),  # of the domain, m
+    "extent": _real("scene", per="axis"),  # size of the domain, m
     "cells": _int("scene", per="axis"),
-    "gravity": _real("scene", per="axis"),  # at time 0, m/s^2
-    "wall_speed": _real("scene"),  # of the fastest wall, m/s
+    "gravity": _real("scene", per="axis"),  # gravity at time 0, m/s^2
+    "wall_speed": _real("scene"),  # speed of the fastest wall, m/s
     "slowest": _real("scene"),  # lower bound of the speed: that of the fastest emitter, m/s
     "end": _real("scene"),  # time, s
     "frames": _int("scene"),  # number of output times after time 0
@@ -72,7 +72,7 @@ RUN: Mapping[str, Entry] = {
     "forced": _int("scene"),  # whether the maximum is used even above the stable step
     "collider": _real("scene", math.inf),  # bound on the step by colliders, s
     "capacity": _int("scene", None, "group"),  # particles, including waiting ones
-    "sensitivity": _real("scene", per="group"),  # of stiffness to strain, see `Law`
+    "sensitivity": _real("scene", per="group"),  # sensitivity of stiffness to strain, see `Law`
     "hardening": _real("scene", per="group"),
     "period": _real("scene", per="emitter"),  # time between two sheets, s
     "until": _real("scene", per="emitter"),  # time from which no sheet enters, s
@@ -96,10 +96,10 @@ RUN: Mapping[str, Entry] = {
     "waits": _int("kernel", per="emitter"),  # whether the next layer is blocked
     # Bounds on the next step.
     "stiffness": _real("host", math.inf),  # bound by the laws from the last measurement, s
-    "stiffness_limit": _int("host"),  # its code in LIMITS
+    "stiffness_limit": _int("host"),  # code of this bound in LIMITS
     "pull": _real("host"),  # bound on the acceleration by forces and steady gravity, m/s^2
-    "force": _real("host", math.inf),  # bound by the slope of forces, s
-    "first_stable_step": _real("host"),  # at time 0, s
+    "force": _real("host", math.inf),  # bound by the gradient of forces, s
+    "first_stable_step": _real("host"),  # stable step at time 0, s
     "own": _real("host", None, "body"),  # bound by the stiffness of each body, s
     "horizon": _real("host", -math.inf),  # end of the filled time tables, s
     "held": _real("kernel", math.inf),  # the bound with a delayed rise, see `StepSize.limit_rise`, s
@@ -108,13 +108,13 @@ RUN: Mapping[str, Entry] = {
     "held_steps": _real("kernel"),  # steps of this series
     # When to measure the state again.
     "longest": _int("host"),  # largest number of steps between two measurements
-    "growth_allowed": _real("host"),  # of the logarithm of a stiffness
+    "growth_allowed": _real("host"),  # permitted growth of the logarithm of a stiffness
     "unwatched": _int("kernel", per="group"),  # steps since the last measurement
     "change": _real("kernel", per="group"),  # growth of that logarithm since then, by deformation
     "hardened": _real("kernel", per="group"),  # the same, by hardening
     # Requests of the host.
     "status": _int("host"),
-    "target": _real("host"),  # time to reach, s
+    "target": _real("host"),  # target time, s
     "given": _real("host"),  # a prescribed step, s, 0 if the kernel chooses it
     "budget": _int("host"),  # steps that may be taken in this launch
     "arrived": _int("kernel"),  # whether the target is reached
@@ -147,16 +147,16 @@ RUN: Mapping[str, Entry] = {
     "maxima": _real("kernel", None, "maximum"),
 }
 STEP: Mapping[str, Entry] = {
-    "spacing": _real("host"),  # of the grid, m
+    "spacing": _real("host"),  # spacing of the grid, m
     "inverse_spacing": _real("host"),
     "gradient_scale": _real("host"),
-    "extent": _real("host", per="axis"),  # of the domain, m
+    "extent": _real("host", per="axis"),  # size of the domain, m
     "dt": _real("kernel"),  # s
     "kick": _real("kernel"),  # s
     "stable": _real("kernel"),  # the largest stable step, s
     "relaxed": _real("kernel"),  # time over which volumes relax, s, 0 in most steps
     "gravity": _real("kernel", per="axis"),  # change of velocity by gravity, m/s
-    "speed_squared": _real("kernel"),  # of the fastest node, m^2/s^2
+    "speed_squared": _real("kernel"),  # squared speed of the fastest node, m^2/s^2
     "rate": _real("kernel", per="group"),  # largest rate of deformation, 1/s
     "volume_change": _real("kernel", per="group"),  # largest change of the logarithm of a volume by relaxation
 }

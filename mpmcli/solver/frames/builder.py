@@ -88,7 +88,7 @@ def sums_of_rows(arrays: FrameArrays, constants: ParticleConstants, *, total: bo
             C = arrays["affine"][0, part].reshape(-1, d, d).astype(np.float64)
             spin = C
             if total:
-                # Nodes lie at F (X_i - X_p) from the particle, and move by C F (X_i - X_p).
+                # Nodes are at F (X_i - X_p) relative to the particle and have the relative velocity C F (X_i - X_p).
                 F = arrays["gradient"][0, part].reshape(-1, d, d).astype(np.float64)
                 C, spin = C @ F, C @ F @ F.transpose(0, 2, 1)
             spins += np.tensordot(mass, spin, 1)

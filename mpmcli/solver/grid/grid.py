@@ -79,7 +79,7 @@ class Grid(LinearNodes):
         tile: edge of a tile, cells.
         tiles: number of tiles per axis.
         tile_count: number of all tiles.
-        shape: nodes per axis, margins included, a multiple of `tile`.
+        shape: nodes per axis, including margins, a multiple of `tile`.
         planes: planes of a stencil normal to the first axis; 1 in 2D.
         runs: number of runs, whose nodes are stored one after the other.
         layers: layers of nodes per run, stored one after the other, each with a velocity field; 1 if all bodies share

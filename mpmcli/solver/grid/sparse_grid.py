@@ -515,4 +515,4 @@ def filled_cells(scene: Scene) -> float:
 
 def require_cpu_if_sparse(settings: SolverSettings, backend: Backend) -> None:
     if settings.grid == "sparse" and not backend.on_cpu:
-        raise InputError('solver.grid = "sparse" is for the CPU; give "auto" or "dense", or --arch cpu.')
+        raise InputError('solver.grid = "sparse" is available only on the CPU; use "auto" or "dense", or --arch cpu.')

@@ -309,7 +309,7 @@ def try_backend(arch: Arch) -> Backend:
             squares[i] = float(i) * float(i)
 
     fill()
-    # Squares of whole numbers below 2^12 are exact in f32.
+    # Squares of integers below 2^12 are exact in f32.
     if not np.array_equal(squares.to_numpy(), np.arange(COUNT, dtype=np.float32) ** 2):
         raise RunError(f"the test kernel of --arch {arch} computed wrong values.")
     return started

@@ -12,7 +12,7 @@ from mpmcli.solver.grid.grid import Grid
 
 @ti.data_oriented
 class NodeUpdate:
-    """Turns momentum into velocity at every node.
+    """Converts momentum to velocity at all nodes.
 
     Attributes:
         images: mirror images beyond walls, which constrain the velocity.
