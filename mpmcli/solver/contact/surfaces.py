@@ -455,9 +455,7 @@ class BodySurfaces:
 
     @ti.func
     def stencil_before(self, grid: ti.template(), node: ti.template(), q: int):
-        """Return the offset of a node from the start of the stencil in which it is q-th, and whether that is in the
-        box.
-        """
+        """Return the offset of a node from the start of a stencil in which it is q-th, and if that is in the box."""
         n = ti.static(grid.scheme.spline.nodes)
         before, rest, inside = 0, q, True
         for b in ti.static(range(self.dimension)):

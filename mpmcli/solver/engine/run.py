@@ -589,7 +589,7 @@ class Run:
 def frames_of_all(runs: Mapping[int, Run]) -> Iterator[tuple[int, tuple[Frame, LedgerRow] | Exception | None]]:
     """Yield the frames of runs that share a batch as they are computed, each with the key of its run.
 
-    The last frame of a run is followed by None; an error that ends a run is yielded instead of frames.
+    The last frame of a run is followed by None, or by the error that ended the run.
     """
     going = dict(runs)
     for key, run in runs.items():

@@ -173,7 +173,7 @@ WHOLE = 2**16
 
 
 class FilledCells:
-    """Volume in cells at T times; particles are added in parts.
+    """The cells filled by particles at T times; particles are added in parts.
 
     A cell is inside if it and all of its neighbours, including corners, contain only particles of flowing materials,
     and at least one. Neighbours beyond a wall impose no condition; beyond a periodic face they are the cells at the

@@ -196,7 +196,7 @@ WORDS = {
 
 @dataclass(frozen=True)
 class LawPlan:
-    """Memory of the particles of one law: their number, and the bytes of each field per particle."""
+    """Memory of the particles of one law: their estimated number, and the bytes of each field per particle."""
 
     law: str
     particles: int

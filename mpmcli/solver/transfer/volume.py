@@ -245,7 +245,7 @@ def held_around(x: ti.template(), grid: ti.template(), last: ti.template()):
     It is the mass, kg, or the volume, m^3, if nodes store the volume scattered to them.
     """
     d = ti.static(grid.dimension)
-    # Number of nodes on each side of a wall that stencils of particles on the other side reach.
+    # Number of nodes beyond a wall that stencils of particles inside reach, and of nodes inside with such images.
     reach = ti.static(grid.scheme.spline.nodes - 2)
     base, distance = grid.scheme.spline.stencil(x, grid.inverse_spacing)
     w = grid.scheme.spline.weights(distance)
