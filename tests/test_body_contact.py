@@ -145,7 +145,7 @@ def test_pairs_that_cannot_be_are_one_sentence(pairs: list, said: str) -> None:
 )
 def test_what_has_one_velocity_field_is_refused(tables: dict, arch: str, reason: str) -> None:
     two = scene([body("a", [2, 2], [8, 8]), body("b", [12, 2], [18, 8])], **tables)
-    with pytest.raises(InputError, match=f"bodies that separate are not available {reason}; give "):
+    with pytest.raises(InputError, match=f"separating bodies are not available {reason}; set "):
         require_contact_possible(two, Backend(arch, 1, "f32", False))
 
 

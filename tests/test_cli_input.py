@@ -165,7 +165,7 @@ def test_too_many_particles_are_refused_before_any_is_made(refused, monkeypatch)
     monkeypatch.setattr("mpmcli.simulation.simulate.build_run", unreachable)
     said = refused("simulate", "scene.toml", scene=HUGE)
     assert said.startswith("scene.toml: The scene needs 1e+12 particles and 1.03e+12 grid nodes, 19")
-    assert " TB of memory, and " in said and said.endswith("fewer particles_per_cell needs less.")
+    assert " TB of memory, but " in said and said.endswith("fewer particles_per_cell.")
 
 
 def test_info_describes_even_a_scene_that_is_too_large(tmp_path):

@@ -262,12 +262,12 @@ def test_a_run_on_cuda_needs_the_memory_of_the_device(monkeypatch: pytest.Monkey
     driver = FakeDriver(10 * 10**9)
     monkeypatch.setattr("mpmcli.solver.machine.backend.ctypes.CDLL", lambda name: driver)
     monkeypatch.setattr("mpmcli.solver.machine.plan.psutil.virtual_memory", lambda: SimpleNamespace(available=10**9))
-    with pytest.raises(InputError, match=r"10\.1 GB of memory on the cuda device, and 8 GB may be used there"):
+    with pytest.raises(InputError, match=r"10\.1 GB of memory on the cuda device, but at most 8 GB may be used;"):
         require_memory(plan)
     driver.free *= 2
     require_memory(plan)
     assert driver.uses == 0
-    with pytest.raises(InputError, match=r"10\.1 GB of memory, and 800 MB may be used here"):
+    with pytest.raises(InputError, match=r"10\.1 GB of memory, but at most 800 MB may be used;"):
         require_memory(replace(plan, arch="cpu"))
     monkeypatch.setattr("mpmcli.solver.machine.backend.ctypes.CDLL", lambda name: FakeDriver(0, present=False))
     require_memory(plan)

@@ -111,8 +111,8 @@ def test_what_cannot_move_freely_is_one_sentence(given: dict, said: str) -> None
     ("tables", "reason"),
     [
         ({"domain": {"walls": {"x_min": "periodic", "x_max": "periodic"}}}, "in a domain with periodic walls"),
-        ({"domain": {"walls": "stick", "wall_velocity": {"y_min": [1.0, 0.0]}}}, "beside walls that move"),
-        ({"contact": {"default": "separate"}}, "beside bodies that separate"),
+        ({"domain": {"walls": "stick", "wall_velocity": {"y_min": [1.0, 0.0]}}}, "with moving walls"),
+        ({"contact": {"default": "separate"}}, "with separating bodies"),
     ],
 )
 def test_what_they_are_not_available_with_is_refused(tables: dict, reason: str) -> None:

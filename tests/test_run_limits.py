@@ -145,12 +145,13 @@ def test_a_device_without_memory_is_a_sentence(start: Callable, tmp_path: Path, 
     with monkeypatch.context() as patch:
         patch.setattr("mpmcli.simulation.simulate.build_run", refuse)
         outcome = start()
-    assert outcome.status == 2 and outcome.stderr.splitlines()[-1].startswith("error: The memory of this machine does")
+    assert outcome.status == 2
+    assert outcome.stderr.splitlines()[-1].startswith("error: There is not enough memory on this machine")
     assert not (tmp_path / "result").exists()
     monkeypatch.setattr("mpmcli.solver.engine.run.Run.frames", refuse)
     outcome = start()
     assert outcome.status == 1 and json.loads(outcome.stdout)["status"] == "failed"
-    assert "does not suffice" in outcome.stderr and "a fault of mpmcli" not in outcome.stderr
+    assert "not enough memory" in outcome.stderr and "a fault of mpmcli" not in outcome.stderr
 
 
 def test_other_errors_are_no_want_of_memory() -> None:

@@ -123,7 +123,7 @@ def test_the_speed_counts_that_of_turning_and_of_a_pivot_that_moves() -> None:
 
 def test_a_device_without_double_precision_moves_no_collider() -> None:
     moving = scene({"velocity": [1.0, 0.0]})
-    with pytest.raises(InputError, match="colliders that move need double precision, which --arch metal lacks"):
+    with pytest.raises(InputError, match="moving colliders need double precision, which --arch metal lacks"):
         Batch(CompiledKind.of(moving, sample_bodies(moving)), Backend("metal", 1, "f32", True))
 
 

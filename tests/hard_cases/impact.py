@@ -1,4 +1,4 @@
-"""Impacts: a fast cube on a wall, a cube crushed to nothing or turned inside out, and a wave that hits a wall."""
+"""Impacts: a fast cube on a wall, a cube that collapses or is inverted, and a wave that hits a wall."""
 
 from dataclasses import replace
 
@@ -67,7 +67,7 @@ def crushed() -> Outcome:
                 outcomes.append(f"{material['law']} at {haste:g} c goes on, J down to {done.ratios[0]:.2g}")
             else:
                 said = done.stopped.diagnosis
-                right = right and said.body == "cube" and any(w in said.cause for w in ("inside out", "crushed"))
+                right = right and said.body == "cube" and any(w in said.cause for w in ("was inverted", "collapsed"))
                 outcomes.append(f"{material['law']} at {haste:g} c stops: particle {said.particle} {said.cause}")
         solver = start(asked)
         F = np.tile(np.eye(2), (cube.count, 1, 1))
@@ -79,7 +79,7 @@ def crushed() -> Outcome:
             outcomes.append(f"{material['law']} with F = diag(-1, 1) goes on")
         except UnstableRunError as error:
             said = error.diagnosis
-            right = right and (said.particle, said.step) == (7, 1) and "inside out" in said.cause
+            right = right and (said.particle, said.step) == (7, 1) and "was inverted" in said.cause
             outcomes.append(f"F = diag(-1, 1) stops at step {said.step}: particle {said.particle} {said.cause}")
     return Outcome(
         right, "no NaN; every stop names the particle" if right else "not as asked", "; ".join(outcomes) + "."

@@ -1,9 +1,9 @@
-"""Contact of bodies with velocity fields of their own: impulses at nodes that two of them, or one and a wall reach.
+"""Contact of bodies with their own velocity fields: impulses at nodes shared by two bodies or by a body and a wall.
 
-At a node the surface of each body is a distance along an axis, by the logarithm of a sum of exponentials over the
-points of the surface around. Of three axes, the mean of both normals and the normals of the faces that look at the
-other, that of the largest gap separates them. The impulse is that of a spring on the gap, by backward Euler, and
-Coulomb's friction. See docs/theory.md, 2.8.
+At a node the surface of each body is represented by its distance along an axis: the logarithm of a sum of exponentials
+over nearby points of the surface. The candidates for the axis are the mean of both normals and the normal of each face
+that faces the other body; the axis with the largest gap separates the bodies. The impulse is that of a spring on the
+gap, by backward Euler, with Coulomb friction. See docs/theory.md, 2.8.
 """
 
 import math
@@ -24,48 +24,52 @@ from mpmcli.solver.particles.sort import TileOrder, stay_rolled
 from mpmcli.solver.transfer.lanes import LANES, zero_lanes
 from mpmcli.solver.transfer.splines import PAD, bounded
 
-# Radius of the ball of a surface point, cells: what lies aside counts as farther away, as the front of a ball would.
+# Radius of the ball of a surface point, cells: points off the axis count as farther away, like the front of a ball.
 BALL = 3.0
-# Sharpness of the soft minimum of distances, per distance of particles.
+# Sharpness of the soft minimum of distances, per particle spacing.
 SHARP = 12.0
-# Sharpness of the mean normal of the faces that look at another body. Bodies whose normals have a larger product look
-# the same way, and not at each other.
+# Sharpness of the mean normal of the faces that face another body. Bodies whose normals have a product above ALIKE face
+# the same direction and not each other.
 FACING, ALIKE = 16.0, 0.7
-# Products of normals from which on one axis is tried only: of the faces of two bodies, and of an obstacle.
+# Products of normals above which only one axis is evaluated: of the faces of two bodies, and of an obstacle.
 SAME, SMOOTH = 0.999, 0.9
-# Differences of gaps over which axes are blended, and the overlap beyond which the push stays the same, cells.
+# Difference of gaps over which axes are blended, and overlap beyond which the push is constant, cells.
 BLEND, DEEPEST = 0.02, 0.3
-# Overlaps between which bodies are stopped more and more, whatever the spring does, cells.
+# Range of overlaps, cells, over which the approach of bodies is increasingly stopped, independent of the spring.
 STOPS = (0.1, 0.2)
-# Of the mass of nodes on flat faces that touch, from which on overlaps and gaps of a node are told.
+# Fraction of the mass of a node at touching flat faces, above which overlaps and gaps of a node are recorded.
 LIGHT = 0.1
-# From the nearest point of an obstacle to where others are looked for, and back to its surface at the most, cells.
+# Reach of the search for further points of an obstacle near its nearest point, cells.
 FAR_ASIDE = 3.0
-# Exponents beyond which single precision has no number; in place of 0 where it divides, or its logarithm is taken.
+# Largest exponent in single precision, and a number that replaces 0 in divisors and logarithms.
 LARGEST, SMALLEST = 80.0, 1e-37
-# The gap of bodies of which one shows no surface, cells: they do not meet.
+# Gap, cells, if one of the bodies has no surface here: they are not in contact.
 APART = 9.0
-# Threads of a GPU that work at nodes of all runs, as each needs memory for surface points, and the fewest of a run.
+# Number of GPU threads for the nodes of all runs, limited because each needs memory for surface points, and smallest
+# number per run.
 GPU_THREADS, LEAST_THREADS = 4096, 64
-# Numbers of a layer: P-wave modulus, Pa, sharpness, 1/m, factor of a sum over a flat surface, density, kg/m^3, and from
-# FRICTION on the coefficient of friction with each layer, `STICKS` for one that sticks.
+# Numbers of a layer: P-wave modulus, Pa, sharpness, 1/m, normalisation of the sum over a flat surface, density, kg/m^3,
+# and from FRICTION on the coefficient of friction with each layer, `STICKS` for sticking.
 MODULUS, SHARPNESS, FLAT, DENSITY, FRICTION = range(5)
-# Of `LedgerRow`, see `BodyContact.extremes`.
+# Entries of `LedgerRow`, see `BodyContact.extremes`.
 EXTREMES = ("contact_overlap", "contact_gap")
 
 
 @ti.data_oriented
 class BodyContact:
-    """What the bodies of a batch do to each other, and obstacles to them; w is the number of a run.
+    """Contact of the bodies of a batch with each other and with obstacles; w is the index of a run.
 
     Attributes:
-        surfaces: what they show; layers: of each run; capacity: surface points near a node, of each body.
-        rows: of each layer of each run its numbers, see MODULUS; threads: of a run on a GPU.
-        loads: what the first layer of each pair takes from the second, about the lower corner, see `Layers.pairs`.
-        extremes: of each run since the last frame the deepest overlap and the largest gap that acted, cells.
-        points: of each thread and of two bodies, row by row, of surface points near a node the way to it, m, by how
-            much farther away than along an axis they count, m, their normals and their weights; of the second body ways
-            and normals with the opposite sign.
+        surfaces: surfaces of the bodies.
+        layers: number of layers per run.
+        capacity: largest number of surface points of a body near a node.
+        rows: numbers of each layer of each run, see MODULUS.
+        threads: threads of a run on a GPU.
+        loads: loads on the first layer of each pair by the second, about the lower corner, see `Layers.pairs`.
+        extremes: per run, the deepest overlap and the largest gap with a push since the last frame, cells.
+        points: surface points of two bodies near a node, per thread, row by row: vector to the node, m, additional
+            distance for being off the axis, m, normal, and weight; vectors and normals of the second body have the
+            opposite sign.
     """
 
     def __init__(
@@ -92,11 +96,11 @@ class BodyContact:
 
     @staticmethod
     def gpu_bytes(stencil: int, layers: Layers, dimension: int, real: int) -> int:
-        """Return the bytes of surface points on a GPU, for stencils of so many nodes per axis."""
+        """Return the bytes of surface points on a GPU, for stencils with `stencil` nodes per axis."""
         return 2 * GPU_THREADS * (2 * dimension + 2) * points_near(stencil, layers, dimension) * real
 
     def write(self, scene: Scene, run: int = 0) -> None:
-        """Set what a run has: its bodies, and the friction between them."""
+        """Set the numbers of the layers of a run, and the friction between them."""
         layers, h = Layers.of(scene), scene.domain.spacing
         self.surfaces.count[run] = layers.count
         rows = np.zeros((layers.count, FRICTION))
@@ -113,7 +117,7 @@ class BodyContact:
                 self.rows[run * self.layers + layer, k] = number
 
     def read(self, run: int) -> dict[str, np.ndarray]:
-        """Return the loads and the extremes of a run since the last frame, on a GPU, and forget them."""
+        """Return the loads and the extremes of a run since the last frame, on a GPU, and reset them."""
         extremes = self.extremes.to_numpy()
         found = {"contact": self.loads.read(run, self.pairs)} | dict(zip(EXTREMES, extremes[run], strict=True))
         extremes[run] = 0.0
@@ -122,7 +126,7 @@ class BodyContact:
 
     @ti.func
     def sum_up(self, run: int, frame: int, column: int, frame_stats: ti.template()):
-        """Store the loads and then the extremes of a frame, from a column on, and forget them."""
+        """Store the loads and then the extremes of a frame, from a column on, and reset them."""
         self.loads.sum_up(run, frame, column, frame_stats)
         for k in ti.static(range(len(EXTREMES))):
             frame_stats[run, frame, column + ti.static(self.loads.capacity * self.loads.width) + k] = self.extremes[
@@ -142,9 +146,9 @@ class BodyContact:
         dt: float,
         gravity_step: ti.template(),
     ):
-        """Let bodies exchange momentum at rows of nodes of the box, and then obstacles push them.
+        """Exchange momentum between bodies, and then with obstacles, at rows of nodes of the box.
 
-        dt: of the step, s; gravity_step: change of velocity by gravity in it, m/s.
+        `dt` is the step, s; `gravity_step` is the change of velocity by gravity in the step, m/s.
         """
         last = ti.static(self.dimension - 1)
         for row in range(first, after):
@@ -167,10 +171,11 @@ class BodyContact:
         dt: float,
         gravity_step: ti.template(),
     ):
-        """Let bodies exchange momentum at a node, by its index in layer 0, and then obstacles push them."""
+        """Exchange momentum between bodies, and then with obstacles, at a node with this index in layer 0."""
         place = self.surfaces.place_of(grid, w, index)
         present = self.surfaces.present[place]
-        # Layers in descending order: pairs of them, then each and the obstacles, whose numbers follow theirs.
+        # Layers in descending order: first all pairs of layers, then each layer with the obstacles, numbered after the
+        # layers.
         for turn in range(ti.select(self.surfaces.met[place] > 1, 2, 1)):
             rest = present
             while rest > 255 or (turn == 1 and rest > ti.static(int(self.surfaces.shares))):
@@ -196,17 +201,17 @@ class BodyContact:
         dt: float,
         gravity_step: ti.template(),
     ):
-        """Let layer a exchange momentum with layer c, or obstacle c - layers, at a node, by its index in layer 0."""
+        """Exchange momentum of layer a with layer c, or obstacle c - layers, at a node with this index in layer 0."""
         h, d, row = ti.static((grid.spacing, self.dimension, w * self.layers))
         at_a, at_c = index + a * ti.static(self.node_count), index + c * ti.static(self.node_count)
         m_a, bodies, way, agree = grid.nodes[at_a][d], c < self.layers, FAR, 0.0
         reduced, friction, known = m_a, 0.0, True
-        # The inverse of the modulus of both.
+        # The sum of the inverse moduli of both.
         soft = 1.0 / self.rows[row + a, MODULUS]
         u, J, facing = ti.Vector.zero(float, d), ti.Vector.zero(float, d), ti.Vector.zero(float, d)
         if bodies:
             m_c = grid.nodes[at_c][d]
-            # In this order: the product of two masses may be too small for single precision.
+            # Evaluated in this order, because the product of two masses may be too small for single precision.
             reduced, friction = m_a * (m_c / (m_a + m_c)), self.rows[row + a, FRICTION + c]
             soft += 1.0 / self.rows[row + c, MODULUS]
             for b in ti.static(range(d)):
@@ -226,10 +231,10 @@ class BodyContact:
         elif bodies or way < REACH * h:
             gap, middle, n, aside = self.separation(grid, w, thread, node, index, a, c, facing, agree)
             if gap >= APART * h and way <= 0.0:
-                # Behind an obstacle what shows no surface, as it was torn or crushed, is stopped.
+                # Material without a surface, because it was torn or crushed, is stopped behind an obstacle.
                 gap, middle, n, aside, known = -h, gap, -facing, 0.0 * facing, False
             if gap < APART * h:
-                # As much as a node there has of flat faces: those with less, and that is at edges, push less.
+                # Mass of such a node at flat faces. Nodes with less mass, which are at edges, push less.
                 light = 1.0 / (self.rows[row + a, DENSITY] * filled((0.5 * gap + middle) * grid.inverse_spacing))
                 if bodies:
                     light += 1.0 / (self.rows[row + c, DENSITY] * filled((0.5 * gap - middle) * grid.inverse_spacing))
@@ -238,10 +243,10 @@ class BodyContact:
                 pushed = self.impulse(gap / h, u, n, aside, kappa, reduced, h / dt, friction)
                 for b in ti.static(range(d)):
                     J[b] = pushed[b]
-                # Nodes of hardly any mass, beside edges, show little of a surface.
+                # Nodes with very little mass, beside edges, do not represent a surface and are not recorded.
                 if known and pushed.dot(n) > 0.0 and reduced > LIGHT * mass:
                     for k, reached in ti.static(enumerate((-gap / h, gap / h))):
-                        # Most are no record, and atomics are slow.
+                        # Most values are not extremes, and atomic operations are slow.
                         if reached > self.extremes[w, k]:
                             ti.atomic_max(self.extremes[w, k], reached)
         for b in ti.static(range(d)):
@@ -266,14 +271,20 @@ class BodyContact:
         speed: float,
         friction: float,
     ):
-        """Return the impulse that c gets and a gives at a node, N s.
+        """Return the impulse from a to c at a node, N s.
 
-        gap: cells; u: velocity of c relative to a, m/s; n, aside: see `separation`; kappa: k dt^2 / m of the spring;
-        reduced: m_a m_c / (m_a + m_c), kg; speed: one cell in the step, m/s.
+        Args:
+            gap: gap, cells.
+            u: velocity of c relative to a, m/s.
+            n, aside: see `separation`.
+            kappa: k dt^2 / m of the spring.
+            reduced: m_a m_c / (m_a + m_c), kg.
+            speed: speed of one cell per step, m/s.
+            friction: coefficient of friction.
         """
         away = u.dot(n)
         push = ti.max(0.0, -away - ti.max(gap, -DEEPEST) * speed) * kappa / (1.0 + kappa)
-        # What is faster than the spring can stop is stopped.
+        # Approach that is too fast for the spring is stopped.
         push = reduced * ti.max(push, -away * ti.min(ti.max((-gap - STOPS[0]) / (STOPS[1] - STOPS[0]), 0.0), 1.0))
         along = u + aside
         along -= along.dot(n) * n
@@ -295,11 +306,18 @@ class BodyContact:
         facing: ti.template(),
         agree: float,
     ):
-        """Return the gap of a and c at a node, m, how far the node is from their middle, m, the normal from a to c, and
-        how much faster c is than a where their surfaces are than at the node, m/s.
+        """Return the gap between layers a and c at a node, and the geometry of the contact.
 
-        a: layer of a body; c: of another one, or of an obstacle, whose points are collected, and of which `facing` and
-        `agree` are what `collect_obstacle` returns.
+        Args:
+            a: layer of a body.
+            c: layer of another body, or number of an obstacle whose points were collected.
+            facing, agree: results of `collect_obstacle` for an obstacle.
+
+        Returns:
+            gap: the gap, m.
+            middle: distance of the node from the middle of the gap, m.
+            normal: normal from a to c.
+            aside: correction of the velocity of c relative to a from the node to the surfaces, m/s.
         """
         h, d, row = ti.static((grid.spacing, self.dimension, w * self.layers))
         gap, middle, normal, smooth = APART * h, 0.0, ti.Vector.zero(float, d), agree > SMOOTH
@@ -325,7 +343,7 @@ class BodyContact:
                 if alike < SAME:
                     first_axis = 0
                 else:
-                    # Not the mean of both normals, which tilts beside edges.
+                    # Not the mean of all normals, which tilts beside edges.
                     for b in ti.static(range(d)):
                         normal[b] = axes[0, b] + axes[1, b]
                     normal = normal.normalized()
@@ -350,7 +368,7 @@ class BodyContact:
                 if j < 3:
                     gaps[j] = gap
                 if j == 2:
-                    # Blended, so that nothing jumps where another axis becomes the best.
+                    # Blended, so that the axis changes continuously.
                     best, blend = gaps.max(), ti.Vector.zero(float, d)
                     for i in range(3):
                         share = exp(ti.max((gaps[i] - best) * grid.inverse_spacing / BLEND, -LARGEST))
@@ -359,7 +377,7 @@ class BodyContact:
                     normal = blend.normalized(SMALLEST)
                     for b in ti.static(range(d)):
                         axes[3, b] = normal[b]
-        # Of the way from the node to the surface of each, along its normal.
+        # Change of velocity from the node to the surface of each body, along its normal.
         aside = ti.Vector.zero(float, d)
         for b in ti.static(range(d)):
             aside[b] = (0.5 * gap + middle) * slopes[0, b] - (0.5 * gap - middle) * slopes[1, b]
@@ -367,9 +385,9 @@ class BodyContact:
 
     @ti.func
     def collect(self, grid: ti.template(), w: int, thread: int, node: ti.template(), index: int, a: int, c: int):
-        """Store the surface points of two layers near a node.
+        """Store the surface points of layers a and c near a node.
 
-        Return their outward normals, how many points, and dv/dn of both, a row each, 1/s.
+        Return their outward normals, the numbers of points, and dv/dn of both, a row each, 1/s.
         """
         h, d = ti.static((grid.spacing, self.dimension))
         n_a, n_c, counts = ti.Vector.zero(float, d), ti.Vector.zero(float, d), ti.Vector.zero(int, 2)
@@ -401,7 +419,7 @@ class BodyContact:
                             if counts[side] < self.capacity:
                                 at = (2 * thread + side) * self.share + counts[side]
                                 for b in ti.static(range(d)):
-                                    # Entry by entry: Taichi may lose vectors that are assigned as a whole.
+                                    # Entry by entry, because Taichi may lose vectors that are assigned as a whole.
                                     way[b] -= depth * n[b]
                                     self.points[at + b * self.capacity] = outwards * way[b]
                                     self.points[at + ti.static(d + 1 + b) * self.capacity] = outwards * n[b]
@@ -415,10 +433,10 @@ class BodyContact:
 
     @ti.func
     def collect_obstacle(self, obstacles: ti.template(), thread: int, o: int, x: ti.template()):
-        """Store points of an obstacle near a place as `collect` does those of a second body, if it is in reach.
+        """Store points of an obstacle near x, like those of a second body in `collect`, if it is within reach.
 
-        They are the nearest one, and those nearest to what lies a cell aside of it, two along each tangent. Return what
-        `Obstacles.at` does, and the least product of the normals of the others with that of the nearest one.
+        They are the nearest point, and the points nearest to positions one cell beside it, two along each tangent.
+        Return the results of `Obstacles.at`, and the smallest product of another normal with that of the nearest point.
         """
         h, d = ti.static((obstacles.spacing, self.dimension))
         place, nearest, facing, velocity = x, x, ti.Vector.zero(float, d), ti.Vector.zero(float, d)
@@ -444,7 +462,7 @@ class BodyContact:
 
     @ti.func
     def sum_points(self, first: int, count: int, axis: ti.template(), beta: float, inverse_width: float):
-        """Return the sum of exponentials of the distances of a node from surface points along an axis, outwards."""
+        """Return the sum of exponentials of distances of a node from surface points along an outward axis."""
         d = ti.static(self.dimension)
         total, begin = 0.0, 0
         while begin < count:
@@ -463,7 +481,7 @@ class BodyContact:
 
     @ti.func
     def normal_along(self, first: int, count: int, axis: ti.template()):
-        """Return the mean normal of the surface points that look along an axis most."""
+        """Return the mean normal of the surface points whose normals are closest to an axis."""
         d = ti.static(self.dimension)
         total, begin = ti.Vector.zero(float, d), 0
         while begin < count:
@@ -490,18 +508,18 @@ class BodyContact:
 
 
 def points_near(stencil: int, layers: Layers, dimension: int) -> int:
-    """Return how many surface points of a body may be near a node: two layers, at four times the density at rest."""
+    """Return the largest number of surface points of a body near a node: two layers at four times the rest density."""
     return 8 * math.ceil((stencil * layers.per_axis) ** (dimension - 1))
 
 
 @ti.func
 def tangent(normal: ti.template(), k: int):
-    """Return the k-th of d - 1 unit vectors that are normal to a unit vector, and to each other."""
+    """Return the k-th of d - 1 unit vectors normal to a unit vector and to each other."""
     result = ti.Vector.zero(float, normal.n)
     if ti.static(normal.n == 2):
         result[0], result[1] = -normal[1], normal[0]
     else:
-        # From the axis that is farthest from the normal.
+        # From the coordinate axis with the largest angle to the normal.
         least = normal.norm_sqr()
         for a in ti.static(range(3)):
             if normal[a] ** 2 < least:
@@ -515,7 +533,7 @@ def tangent(normal: ti.template(), k: int):
 
 @ti.func
 def spline(r: float):
-    """Return the quadratic spline at r cells from its node."""
+    """Return the quadratic B-spline at r cells from its node."""
     far = ti.abs(r)
     beyond = ti.max(1.5 - far, 0.0)
     return ti.select(far < 0.5, 0.75 - far**2, 0.5 * beyond**2)
@@ -523,9 +541,9 @@ def spline(r: float):
 
 @ti.func
 def traction(r: float):
-    """Return the share that a node at r cells from a surface has of the traction there.
+    """Return the fraction of a surface traction that acts on a node at r cells from the surface.
 
-    It is the force on the node of a uniform stress up to the surface, 4 w(r) r summed over all particles behind it.
+    It is the force on the node by a uniform stress up to the surface, 4 w(r) r summed over all particles behind it.
     """
     far = ti.abs(r)
     beyond = ti.max(1.5 - far, 0.0)
@@ -534,7 +552,7 @@ def traction(r: float):
 
 @ti.func
 def filled(r: float):
-    """Return the share of the quadratic spline of a node that a body with a flat surface r cells before it fills."""
+    """Return the fraction of the quadratic B-spline of a node inside a body whose flat surface is r cells before it."""
     far = ti.abs(r)
     beyond = ti.max(1.5 - far, 0.0)
     outside = ti.select(far < 0.5, 0.5 - far * (0.75 - far**2 / 3.0), beyond**3 / 6.0)

@@ -1,4 +1,4 @@
-"""Which bodies of a scene have velocity fields of their own, and what pairs of them do where they meet."""
+"""Bodies of a scene with their own velocity fields, and the friction between pairs of them."""
 
 import math
 from dataclasses import dataclass, field
@@ -12,21 +12,21 @@ from mpmcli.scene.sampling import points_per_cell
 from mpmcli.solver.grid.sparse_grid import wants_sparse
 from mpmcli.solver.machine.backend import Backend
 
-# A node keeps the numbers of the layers that have mass there in bytes; of more than eight the first are forgotten.
+# A node stores the numbers of the layers with mass in bytes of one integer; of more than eight, the first are lost.
 MOST_LAYERS = 255
-# In place of a coefficient of friction: the two have one velocity at nodes that both reach.
+# Used instead of a coefficient of friction: both layers have the same velocity at common nodes.
 STICKS = -1.0
 
 
 @dataclass(frozen=True)
 class Layers:
-    """The layers of nodes of a run: each body that separates has one, and with it a velocity field.
+    """The layers of nodes of a run: each separating body has its own layer with a velocity field.
 
     Attributes:
-        count: of layers, 1 where all bodies share one velocity field, or there is one body.
-        shares: whether layer 0 belongs to all bodies that have none of their own.
-        per_axis: the most particles of a body with a layer of its own along the edge of a cell.
-        numbers: the layer of each source.
+        count: number of layers; 1 if all bodies share one velocity field or there is a single body.
+        shares: whether layer 0 belongs to all bodies without their own layer.
+        per_axis: largest number of particles along the edge of a cell, of all bodies with their own layers.
+        numbers: layer of each source.
     """
 
     count: int
@@ -47,20 +47,20 @@ class Layers:
 
     @property
     def separate(self) -> bool:
-        """Whether any body has a layer of its own, and meets others, walls and colliders by its surface."""
+        """Whether any body has its own layer, and is in contact with bodies, walls and colliders by its surface."""
         return self.count > 1 or not self.shares
 
     @property
     def pairs(self) -> int:
-        """How many pairs of layers there are: (0, 1), (0, 2), (1, 2), (0, 3)..."""
+        """Number of pairs of layers: (0, 1), (0, 2), (1, 2), (0, 3)..."""
         return math.comb(self.count, 2)
 
     def has_own(self, source: int) -> bool:
-        """Return whether a source has a layer of its own."""
+        """Return whether a source has its own layer."""
         return self.numbers[source] > 0 or not self.shares
 
     def frictions(self, scene: Scene) -> np.ndarray:
-        """Return the coefficient of friction of each pair of layers, (count, count); `STICKS` for those that stick."""
+        """Return the coefficient of friction of each pair of layers, (count, count), `STICKS` for sticking pairs."""
         result = np.full((self.count, self.count), STICKS)
         for i, one in enumerate(scene.sources):
             for k, other in enumerate(scene.sources[:i]):
@@ -72,10 +72,10 @@ class Layers:
 
 
 def require_contact_possible(scene: Scene, backend: Backend) -> None:
-    """Refuse a scene whose bodies separate, and whose grid or backend has one velocity field only.
+    """Raise an error if bodies of a scene separate and its grid or backend supports only one velocity field.
 
     Raises:
-        InputError: says what the scene or the backend has that contact is not available with.
+        InputError: names the property of the scene or the backend with which contact is not available.
     """
     layers = Layers.of(scene)
     reasons = {
@@ -89,5 +89,5 @@ def require_contact_possible(scene: Scene, backend: Backend) -> None:
     for reason, applies in reasons.items():
         if applies and layers.separate:
             raise InputError(
-                f'bodies that separate are not available {reason}; give contact.default = "stick" and no pairs.'
+                f'separating bodies are not available {reason}; set contact.default = "stick" and omit the pairs.'
             )

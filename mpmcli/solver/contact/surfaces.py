@@ -1,9 +1,9 @@
-"""What bodies with velocity fields of their own show each other, walls and colliders near nodes where they meet.
+"""Surface data of bodies with their own velocity fields, near nodes where they may be in contact.
 
-Each particle carries the depth D below the nearest face of its body at rest, and the normal N of that face. Under F
-they become d = D / |F^-T N| and n = F^-T N / |F^-T N|, and x + d n is a point of the surface. Particles that show
-something are put into bins, one for each node at which stencils begin. Walls and colliders that let go are met by
-their exact distance.
+Each particle stores the depth D below the nearest face of its body at rest, and the normal N of that face. Under F they
+become d = D / |F^-T N| and n = F^-T N / |F^-T N|, and x + d n is a point of the surface. Particles with a surface point
+("shown" particles) are inserted into bins, one for each node at which stencils begin. Contact with separating walls and
+colliders uses their exact distance.
 """
 
 from collections.abc import Sequence
@@ -22,20 +22,22 @@ from mpmcli.solver.particles.arrays import ParticleArrays
 from mpmcli.solver.particles.sort import TileOrder, stay_rolled
 from mpmcli.solver.transfer.splines import PAD
 
-# Nodes farther from a surface than this take no part in contact, cells: the reach of the spline that shares it out.
+# Distance from a surface, cells, beyond which nodes are not in contact: half the support of the spline that distributes
+# it.
 REACH = 1.5
-# Of an obstacle that is not there or does not act, m; nodes beyond those of any grid.
+# Distance of an obstacle that is absent or does not act, m; and a node index beyond any grid.
 FAR, ALL_NODES = 1e30, 2**20
 
 
 @ti.data_oriented
 class Obstacles:
-    """The walls and colliders of one run, in a kernel: the faces of the domain first, then the faces of colliders.
+    """Walls and colliders of one run in a kernel: first the faces of the domain, then the faces of colliders.
 
     Attributes:
-        walls, colliders: views of the run, see `device.RunView`; colliders are None where there are none.
-        faces: walls that let go; sides: the most faces of a collider.
-        any: whether there may be any obstacle.
+        walls, colliders: views of the run, see `device.RunView`; `colliders` is None if there are none.
+        faces: separating walls.
+        sides: largest number of faces of a collider.
+        any: whether there can be any obstacle.
     """
 
     def __init__(self, walls: Walls, colliders: Colliders | None, spacing: object) -> None:
@@ -55,7 +57,7 @@ class Obstacles:
 
     @ti.func
     def collider_of(self, o: int):
-        """Return the collider that an obstacle belongs to, and its number in the batch; -1 of a wall."""
+        """Return the collider of an obstacle, and its index in the batch; -1 for a wall."""
         k, i = -1, -1
         if ti.static(self.collides):
             if o >= ti.static(len(self.faces)):
@@ -65,10 +67,10 @@ class Obstacles:
 
     @ti.func
     def at(self, o: int, x: ti.template(), reach: float):
-        """Return how far a place is from an obstacle, m, its normal into the material, velocity, m/s, and friction.
+        """Return the distance of a point to an obstacle, m, its normal into the material, velocity, m/s, and friction.
 
-        These are those of the nearest point. Beyond the reach, cells, the distance is a lower bound, and there is no
-        normal; x: from the lower corner, m.
+        Normal and velocity are those of the nearest point of the obstacle. Beyond `reach`, cells, the distance is a
+        lower bound and the normal zero. x is relative to the lower corner, m.
         """
         d, h = ti.static((self.dimension, self.spacing))
         distance, friction, normal, velocity = FAR, 0.0, ti.Vector.zero(float, d), ti.Vector.zero(float, d)
@@ -110,7 +112,7 @@ class Obstacles:
 
     @ti.func
     def nearest(self, x: ti.template(), reach: float):
-        """Return the distance of the nearest obstacle, m, see `at`."""
+        """Return the distance to the nearest obstacle, m, see `at`."""
         least = FAR
         for o in range(self.count()):
             distance, _normal, _velocity, _friction = self.at(o, x, reach)
@@ -119,7 +121,7 @@ class Obstacles:
 
     @ti.func
     def range(self, o: int):
-        """Return the first and the last node per axis that may touch what meets an obstacle."""
+        """Return the first and last node per axis that may be in contact with an obstacle."""
         low, high = ti.Vector([-ALL_NODES] * self.dimension), ti.Vector([ALL_NODES] * self.dimension)
         for f, face in ti.static(enumerate(self.faces)):
             if o == f:
@@ -131,7 +133,7 @@ class Obstacles:
         if ti.static(self.collides):
             k, i = self.collider_of(o)
             if k >= 0:
-                # Some more for what its own reach leaves out, and for rounding.
+                # A margin beyond the reach stored with the collider, and for rounding.
                 wider = ti.static(REACH - COLLIDERS_REACH + 0.1)
                 for a in ti.static(range(self.dimension)):
                     place = self.colliders.place[i][a]
@@ -143,7 +145,7 @@ class Obstacles:
 
     @ti.func
     def take(self, o: int, node: ti.template(), x: ti.template(), impulse: ti.template()):
-        """Book the impulse that an obstacle gets from a node, N s, if it is a collider."""
+        """Add the impulse on an obstacle from a node, N s, to its loads if it is a collider."""
         if ti.static(self.collides):
             k, i = self.collider_of(o)
             if k >= 0:
@@ -152,32 +154,33 @@ class Obstacles:
 
 @ti.func
 def place_of(node: ti.template(), spacing: float):
-    """Return where a node is, from the lower corner, m."""
+    """Return the position of a node relative to the lower corner, m."""
     return ti.cast(node - PAD, float) * spacing
 
 
-# Stretch of the smallest principal axis, inverse, up to which particles are found.
+# Inverse of the smallest principal stretch up to which particles are found.
 CRUSHED = 4.0
-# In place of the first particle of a bin: none yet, or none ever. In place of a particle's layer: it shows nothing.
+# Values in place of the first particle of a bin: empty, or closed. Value in place of the layer of a particle that is
+# not shown.
 EMPTY, CLOSED, HIDDEN = -1, -2, -1
-# In place of the depth of a particle that shows nothing.
+# Depth of particles that are never shown.
 BELOW_ALL = 1e30
-# Parts of the distance of particles: by how much a point is moved off edges between faces that are equally near, of
-# which one is taken, and the step of the difference that finds the normal.
+# Fractions of the particle spacing: the offset of points from edges between equally near faces, which selects one face,
+# and the step of the finite difference for the normal.
 ASIDE, STEP = 1e-4, 1e-6
 
 
 def rest_surface(body: Body, particles: BodyParticles, spacing: float | None) -> np.ndarray:
-    """Return the unit normal N, outwards, and the depth D, m, that particles carry, (n, d + 1).
+    """Return the outward unit normal N and the depth D, m, of particles, (n, d + 1).
 
-    A body that starts deformed has its shape then: N is along F^T n, and D = d / |F^T n|. spacing: of the grid, m; None
-    of a body that shows no surface, whose particles are all too deep.
+    The shape of an initially deformed body is the deformed one: N is along F^T n, and D = d / |F^T n|. `spacing` is
+    that of the grid, m; None for a body without a surface, whose particles get the depth BELOW_ALL.
     """
     position, d = particles.position, particles.position.shape[1]
     if spacing is None:
         return np.full((len(position), d + 1), BELOW_ALL)
     form, distance = body.shape.form, lattice_spacing(body, spacing)
-    # Away from the middle, so that a mirror image has the mirror images of normals.
+    # Offset away from the centre, so that mirrored bodies have mirrored normals.
     away = np.where(position < np.mean(form.bounds(), axis=0), -1.0, 1.0)
     place = position + ASIDE * distance * away * [1.0, 0.618, 0.414][:d]
     steps = STEP * distance * np.eye(d)
@@ -193,26 +196,28 @@ def rest_surface(body: Body, particles: BodyParticles, spacing: float | None) ->
 
 @ti.data_oriented
 class BodySurfaces:
-    """What the bodies of a batch show each other, and where they meet; w is the number of a run.
+    """Surfaces of the bodies of a batch, and where they may be in contact; w is the index of a run.
 
     Attributes:
-        layers: of each run; groups, orders: of particles; surfaced: numbers of those that carry surfaces.
-        low, high: of each layer of each run, the range of the nodes at which stencils began at the last sort.
-        used: of each of them, the nodes in use, as `Grid.box`; box: of each run, those where layers meet each other
-            or an obstacle.
-        drift: of each run, cells that particles may have moved since the sort.
-        band: of each layer of each run, the depth below its surface up to which particles show it, m.
-        present: of each node of a run in that box the layers that have mass there, increased by 1, a byte each.
-        met: of each of these nodes 1 where two bodies with layers of their own are, and 2 more where an obstacle is in
+        layers: number of layers per run.
+        groups, orders: groups of particles and their tile orders.
+        surfaced: indices of the groups with surfaces.
+        low, high: per layer of each run, the range of first nodes of stencils at the last sort.
+        used: per layer of each run, the nodes in use, as in `Grid.box`.
+        box: per run, the box of nodes where layers may be in contact with each other or with an obstacle.
+        drift: per run, the largest displacement of particles since the sort, cells.
+        band: per layer of each run, the depth below the surface up to which particles are shown, m.
+        present: per node of a run in the box, the layers with mass there plus 1, one byte each.
+        met: per node in the box, 1 if two bodies with their own layers are present, plus 2 if an obstacle is within
             reach of one.
-        first: of each node and surfaced group, its bin: the first particle that shows something whose stencil begins
-            there, EMPTY, or CLOSED where nothing meets at a node of that stencil; following: of each particle, the
-            next one.
-        end: of each tile, the particle after the last one that may show something.
-        counted, rank, slots, reserved: on a GPU, of each bin how many it has; of each particle how many its bin had
-            before it; places of the particles, bin by bin; and how many of these a run has reserved.
-        shown: of each particle its layer, or HIDDEN; surface: the normal n of its body, the depth d below it, m,
-            and dv/dn, 1/s.
+        first: per node and surfaced group, the bin: the first shown particle whose stencil begins there, EMPTY, or
+            CLOSED if there is no contact at any node of that stencil.
+        following: the next particle in the bin of each particle.
+        end: per tile, the index after the last particle that may be shown.
+        counted, rank, slots, reserved: on a GPU, number of particles per bin; rank of each particle in its bin; the
+            particles, bin by bin; and number of reserved slots per run.
+        shown: layer of each particle, or HIDDEN.
+        surface: per particle, the normal n of the body, the depth d below the surface, m, and dv/dn, 1/s.
     """
 
     def __init__(
@@ -252,24 +257,24 @@ class BodySurfaces:
 
     @staticmethod
     def bytes_needed(nodes: int, tiles: int, particles: Sequence[int], surface: int, *, on_cpu: bool) -> int:
-        """Return the bytes for so many nodes, tiles, and particles per group of which each shows so many bytes."""
+        """Return the bytes for these nodes, tiles and particles per group; `surface` is the bytes per particle."""
         own = nodes * 12 + (nodes + tiles) * 4 * len(particles) + sum(particles) * (8 + surface)
         return own if on_cpu else own + 4 * nodes * len(particles) + 8 * sum(particles)
 
-    # Where bodies may meet.
+    # Where bodies may be in contact.
 
     @ti.func
     def forget(self, w: int):
-        """Forget where the bodies of a run are, before their particles are seen anew."""
+        """Reset the ranges of the layers of a run, before its particles are added again."""
         for layer in range(w * self.layers, w * self.layers + self.count[w]):
             for a in ti.static(range(self.dimension)):
                 self.low[layer][a], self.high[layer][a] = 2**30, -(2**30)
 
     @ti.func
     def widen(self, layer: int, base: ti.template()):
-        """Let the range of a layer, counted over all runs, include a stencil."""
+        """Extend the range of a layer, counted over all runs, to a stencil."""
         for a in ti.static(range(self.dimension)):
-            # The comparisons may be late, and save most atomics of a GPU.
+            # The comparisons may use old values; they avoid most atomic operations on a GPU.
             if base[a] < self.low[layer][a]:
                 ti.atomic_min(self.low[layer][a], base[a])
             if base[a] > self.high[layer][a]:
@@ -277,9 +282,9 @@ class BodySurfaces:
 
     @ti.func
     def find_box(self, grid: ti.template(), obstacles: ti.template(), w: int, drift: int, last: ti.template()):
-        """Find the nodes that layers use, and those where they may meet, `drift` cells after the sort; free all places.
+        """Find the nodes used by layers and the box of possible contact, `drift` cells after the sort; free all slots.
 
-        Among these are the nodes at which the stencils begin of what meets there.
+        The box includes the first nodes of the stencils of all particles in contact there.
         """
         d, reach, begin = ti.static((self.dimension, grid.scheme.spline.nodes - 1, w * self.layers))
         self.drift[w] = drift
@@ -289,7 +294,7 @@ class BodySurfaces:
             stay_rolled(self.orders[0].buffers.real, layer)
             for a in ti.static(range(d)):
                 first, end = box_of(grid, a, self.low[layer][a], self.high[layer][a], drift, last[a])
-                # What flows in, and what other bodies share with it, is anywhere in the box of all.
+                # Emitted material, and bodies that share its layer, may be anywhere in the box of all layers.
                 if ti.static(self.shares):
                     if layer == begin:
                         first, end = grid.box[2 * w, a], grid.box[2 * w, a] + grid.box[2 * w + 1, a] - 1
@@ -320,18 +325,18 @@ class BodySurfaces:
 
     @ti.func
     def ball_of(self, first: ti.template(), last: ti.template(), spacing: float):
-        """Return the middle and the radius of the ball around a box of nodes, m."""
+        """Return the centre and the radius of the ball around a box of nodes, m."""
         low, high = ti.cast(first - PAD, float), ti.cast(last - PAD, float)
         return 0.5 * spacing * (low + high), 0.5 * spacing * (high - low).norm()
 
     @ti.func
     def place_of(self, grid: ti.template(), w: int, index: int):
-        """Return the place in `present` and in `first` of a node, by its linear index in layer 0."""
+        """Return the index of a node in `present` and `first`, given its linear index in layer 0."""
         return index - grid.first_node + w * ti.static(self.node_count)
 
     @ti.func
     def clear_rows(self, grid: ti.template(), w: int, first: int, after: int):
-        """Forget who is present at rows of nodes of the box, which is that of the grid here and below."""
+        """Clear rows of nodes of the box, which is the box of `grid` here and below."""
         for row in range(first, after):
             node = grid.row_start(row)
             place = self.place_of(grid, w, grid.linear_index(node))
@@ -341,7 +346,7 @@ class BodySurfaces:
 
     @ti.func
     def clear(self, place: int):
-        """Forget who is present at a node."""
+        """Clear a node."""
         self.present[place] = 0
         for g in ti.static(self.surfaced):
             self.first[g][place] = CLOSED
@@ -350,7 +355,7 @@ class BodySurfaces:
 
     @ti.func
     def find_rows(self, grid: ti.template(), obstacles: ti.template(), w: int, first: int, after: int):
-        """Find which layers have mass at rows of nodes, and whether they meet anything."""
+        """Find which layers have mass at rows of nodes, and whether they may be in contact."""
         last = ti.static(self.dimension - 1)
         for layer in range(self.count[w]):
             used, behind = 2 * (w * self.layers + layer), layer * ti.static(self.node_count)
@@ -371,7 +376,7 @@ class BodySurfaces:
                             self.present[place + k] = 256 * self.present[place + k] + layer + 1
         for row in range(first, after):
             node = grid.row_start(row)
-            # The node up to which no obstacle is near.
+            # `far` is the node up to which no obstacle is near.
             place, far = self.place_of(grid, w, grid.linear_index(node)), node[last]
             for k in range(grid.row_length(node)):
                 bodies = self.bodies_at(place + k)
@@ -386,7 +391,7 @@ class BodySurfaces:
 
     @ti.func
     def meet(self, grid: ti.template(), node: ti.template(), place: int, met: int):
-        """Store what meets at a node, see `met`, and open the bins of the stencils that hold it."""
+        """Store `met` of a node, and open the bins of the stencils that contain it."""
         self.met[place] = met
         if met > 0:
             for q in range(ti.static(grid.scheme.spline.nodes**self.dimension)):
@@ -397,7 +402,7 @@ class BodySurfaces:
 
     @ti.func
     def find(self, grid: ti.template(), obstacles: ti.template(), w: int, node: ti.template()):
-        """Do for one node what `find_rows` does for rows."""
+        """Find which layers have mass at a node, and whether they may be in contact, like `find_rows`."""
         index = grid.linear_index(node)
         place = self.place_of(grid, w, index)
         present = ti.cast(0, ti.i64)
@@ -419,7 +424,7 @@ class BodySurfaces:
 
     @ti.func
     def opens(self, g: ti.template(), grid: ti.template(), w: int, low: ti.template(), high: ti.template()):
-        """Return whether a bin is open of a node in a box, given its first and its last node."""
+        """Return whether the bin of any node in a box, given by its first and last node, is open."""
         last = ti.static(self.dimension - 1)
         first, end, rows, found = low, high, 1, False
         for a in ti.static(range(self.dimension)):
@@ -441,7 +446,7 @@ class BodySurfaces:
 
     @ti.func
     def bodies_at(self, place: int):
-        """Return how many bodies with layers of their own are present at a node."""
+        """Return the number of bodies with their own layers that are present at a node."""
         bodies, rest = 0, self.present[place]
         while rest > 0:
             bodies += ti.cast((rest & 255) > ti.static(int(self.shares)), int)
@@ -450,7 +455,7 @@ class BodySurfaces:
 
     @ti.func
     def stencil_before(self, grid: ti.template(), node: ti.template(), q: int):
-        """Return how far before a node the stencil begins whose q-th node it is, and whether that is in the box."""
+        """Return the offset of a node from the start of a stencil in which it is q-th, and if that is in the box."""
         n = ti.static(grid.scheme.spline.nodes)
         before, rest, inside = 0, q, True
         for b in ti.static(range(self.dimension)):
@@ -462,11 +467,11 @@ class BodySurfaces:
             rest = after
         return before, inside
 
-    # What they show.
+    # Surface data.
 
     @ti.func
     def tiles(self, grid: ti.template(), w: int):
-        """Return the first tile per axis, and how many along it have particles whose stencils may begin in the box."""
+        """Return the first tile and the number of tiles per axis with particles whose stencils may begin in the box."""
         first, count = ti.Vector.zero(int, self.dimension), ti.Vector.zero(int, self.dimension)
         for a in ti.static(range(self.dimension)):
             first[a] = ti.raw_div(ti.max(grid.box[0, a] - self.drift[w], 0), ti.static(grid.tile))
@@ -485,7 +490,7 @@ class BodySurfaces:
 
     @ti.func
     def tile_at(self, grid: ti.template(), order: ti.template(), w: int, q: int):
-        """Return the number of the q-th of these tiles in `order.start`, and its place per axis."""
+        """Return the index in `order.start` of the q-th of these tiles, and its position per axis."""
         first, count = self.tiles(grid, w)
         place, rest, tile = first, q, 0
         for b in ti.static(range(self.dimension)):
@@ -499,7 +504,7 @@ class BodySurfaces:
 
     @ti.func
     def bin_of(self, grid: ti.template(), w: int, base: ti.template()):
-        """Return the bin of the stencils that begin at a node, -1 outside the box."""
+        """Return the bin of the stencils that begin at a node, or -1 outside the box."""
         place = self.place_of(grid, w, grid.linear_index(base))
         for a in ti.static(range(self.dimension)):
             if base[a] < grid.box[0, a] or base[a] >= grid.box[0, a] + grid.box[1, a]:
@@ -508,7 +513,7 @@ class BodySurfaces:
 
     @ti.func
     def show(self, g: ti.template(), grid: ti.template(), w: int, q: int):
-        """Find what the particles of the g-th group in the q-th tile show."""
+        """Find the surface data of the particles of the g-th group in the q-th tile."""
         tile, place = self.tile_at(grid, self.orders[g], w, q)
         begin, end = self.orders[g].start[tile], self.orders[g].start[tile + 1]
         if begin < end:
@@ -521,12 +526,12 @@ class BodySurfaces:
 
     @ti.func
     def show_particle(self, g: ti.template(), grid: ti.template(), w: int, p: int):
-        """Find what a particle of the g-th group shows."""
+        """Find the surface data of a particle of the g-th group."""
         d, group = ti.static((self.dimension, self.groups[g]))
         base, _ = grid.scheme.spline.stencil(group.x[p], grid.inverse_spacing)
         shown, layer = HIDDEN, group.layer_of(p)
         band = self.band[w * self.layers + layer]
-        # What lies deeper at rest is farther from the surface than the band, unless it is crushed.
+        # Particles that are deeper at rest are farther from the surface than the band, unless they are crushed.
         if group.carried[p][d] < CRUSHED * band:
             bin_ = self.bin_of(grid, w, base)
             if bin_ >= 0 and self.first[g][ti.max(bin_, 0)] != CLOSED:
@@ -549,7 +554,7 @@ class BodySurfaces:
 
     @ti.func
     def link(self, g: ti.template(), grid: ti.template(), w: int, q: int):
-        """Put the particles of the g-th group in the q-th tile that show something into their bins."""
+        """Insert the shown particles of the g-th group in the q-th tile into their bins."""
         tile, _ = self.tile_at(grid, self.orders[g], w, q)
         for p in range(self.orders[g].start[tile], self.end[g][tile]):
             stay_rolled(self.orders[0].buffers.real, p)
@@ -559,8 +564,8 @@ class BodySurfaces:
                 self.following[g][p] = self.first[g][place]
                 self.first[g][place] = p
 
-    # On a GPU, where every node or particle has a thread: particles are counted bin by bin, bins reserve their places,
-    # particles take these, and the places of each bin become its list.
+    # On a GPU, with a thread per node or particle: particles are counted per bin, bins reserve slots, particles are
+    # stored in these, and the slots of each bin are linked to its list.
 
     @ti.func
     def bin_at(self, g: ti.template(), grid: ti.template(), w: int, p: int):
@@ -570,14 +575,14 @@ class BodySurfaces:
 
     @ti.func
     def count_particle(self, g: ti.template(), grid: ti.template(), w: int, p: int):
-        """Find what a particle of the g-th group shows, and count it."""
+        """Find the surface data of a particle of the g-th group, and count it in its bin."""
         self.show_particle(g, grid, w, p)
         if self.shown[g][p] != HIDDEN:
             self.rank[g][p] = ti.atomic_add(self.counted[g][self.bin_at(g, grid, w, p)], 1)
 
     @ti.func
     def reserve(self, w: int, place: int):
-        """Reserve places for the bins of a node."""
+        """Reserve slots for the bins of a node."""
         for g in ti.static(self.surfaced):
             if self.counted[g][place] > 0:
                 begin = w * ti.static(self.groups[g].capacity // self.runs)
@@ -585,13 +590,13 @@ class BodySurfaces:
 
     @ti.func
     def put(self, g: ti.template(), grid: ti.template(), w: int, p: int):
-        """Put a particle of the g-th group into its place."""
+        """Store a particle of the g-th group in its slot."""
         if self.shown[g][p] != HIDDEN:
             self.slots[g][self.first[g][self.bin_at(g, grid, w, p)] + self.rank[g][p]] = p
 
     @ti.func
     def chain(self, _w: int, place: int):
-        """Make lists of the places of the bins of a node."""
+        """Link the slots of the bins of a node to lists."""
         for g in ti.static(self.surfaced):
             if self.counted[g][place] > 0:
                 begin, end = self.first[g][place], self.first[g][place] + self.counted[g][place]

@@ -1,10 +1,10 @@
-"""Elastic bodies with `solids = "total"`: on the grid of their state at rest, and in contact.
+"""Elastic bodies with `solids = "total"`: grid of the state at rest, and contact.
 
-Particles scatter and gather at the places X that they have at rest, with the first Piola-Kirchhoff stress P = tau F^-T
-and dv/dX: total Lagrangian (docs/theory.md, 2.6; de Vaucorbeil, Nguyen, Hutchinson 2020). No stencil ever changes. What
-the body meets after the start is not on that grid: walls push at particles, and particles of different bodies repel
-each other. For that they are in bins, two cells wide, by the places where they were when they were last sorted. Forces
-act along the line between two particles, so that momentum and angular momentum are conserved (docs/theory.md, 2.7).
+Particles scatter and gather at their positions X at rest, with the first Piola-Kirchhoff stress P = tau F^-T and dv/dX:
+total Lagrangian (docs/theory.md, 2.6; de Vaucorbeil, Nguyen, Hutchinson 2020). Stencils never change. Contact during
+the run does not use this grid: walls push particles, and particles of different bodies repel each other. For this
+purpose particles are stored in bins, two cells wide, by their positions at the last sort. Forces act along the line
+between two particles, so that momentum and angular momentum are conserved (docs/theory.md, 2.7).
 """
 
 import math
@@ -17,13 +17,13 @@ from mpmcli.solver.grid.grid import Grid
 from mpmcli.solver.machine.backend import Backend
 from mpmcli.solver.particles.arrays import MASS, VOLUME, ParticleArrays
 
-# A body that begins within this distance of a wall that slips or sticks, cells, is held by that wall for good.
+# A body that starts within this distance, cells, of a slipping or sticking wall is permanently held by that wall.
 HELD = 1.0
 
 
 @ti.func
 def pulled_back(tau: ti.template(), F: ti.template()):
-    """Return the first Piola-Kirchhoff stress of a Kirchhoff stress, tau F^-T."""
+    """Return the first Piola-Kirchhoff stress tau F^-T of a Kirchhoff stress tau."""
     return tau @ F.inverse().transpose()
 
 
@@ -37,10 +37,11 @@ def push_of_walls(
     row: ti.template(),
     constants: ti.template(),
 ):
-    """Return the acceleration of a particle at x, at rest at X, m, by the walls that it presses on, m/s^2.
+    """Return the acceleration, m/s^2, by walls of a particle at x, m, with position X at rest, m.
 
-    A particle is the ellipse that F makes of a ball of its spacing s. Where it reaches beyond a wall by g, the wall
-    pushes it with (lambda + 2 mu) V / (m s h) g, about as stiff as the material. row: of the table.
+    A particle is the ellipse to which F deforms a ball with the diameter of the particle spacing s. If it overlaps a
+    wall by g, the wall accelerates it by (lambda + 2 mu) V / (m s h) g, about as stiff as the material. `row` is the
+    row of the table.
     """
     d = ti.static(group.dimension)
     push = ti.Vector.zero(float, d)
@@ -65,7 +66,7 @@ def stiffness_of(particles: ti.template(), group: ti.template(), row: ti.templat
 
 @ti.func
 def stretch_along(F: ti.template(), a: ti.template()):
-    """Return |F^T n| for the axis a as n."""
+    """Return |F^T n| with n along axis a."""
     stretched = 0.0
     for b in ti.static(range(F.m)):
         stretched += F[a, b] * F[a, b]
@@ -76,12 +77,12 @@ def stretch_along(F: ti.template(), a: ti.template()):
 def overlap_of(
     particles: ti.template(), x: ti.template(), X: ti.template(), stretched: float, spacing: float, face: ti.template()
 ):
-    """Return how far a particle reaches beyond a wall, m, and whether the wall pushes it."""
+    """Return the overlap of a particle with a wall, m, and whether the wall pushes it."""
     a, side = ti.static(face)
     distance, at_rest = x[a], X[a]
     if ti.static(side == 1):
         distance, at_rest = particles.extent[a] - x[a], particles.extent[a] - X[a]
-    # A body that fills its place up to the wall begins without a push, whatever its spacing along this axis.
+    # A body that initially touches the wall starts without a push, whatever its spacing along this axis.
     overlap = ti.min(0.5 * spacing, at_rest) * stretched - distance
     meets = overlap > 0.0
     if ti.static(particles.faces[a][side] != "separate"):
@@ -90,19 +91,21 @@ def overlap_of(
 
 
 def slips_in(settings: SolverSettings, rough: Sequence[tuple[int, int]]) -> bool:
-    """Return whether particles remember how far they slipped; `rough` are the faces with friction."""
+    """Return whether particles store their slip; `rough` are the faces with friction."""
     return settings.solids == "total" and len(rough) > 0
 
 
 @ti.func
 def friction_of_walls(particles: ti.template(), group: ti.template(), p: int, kick: float, counts: bool):
-    """Return the acceleration of a particle by friction of the walls that push it, m/s^2.
+    """Return the acceleration, m/s^2, of a particle by friction on the walls that push it.
 
-    As a spring with a slider does, friction pulls it back with the stiffness of the push by what it has slipped, and at
-    most with the coefficient times the push (Cundall and Strack 1979; docs/theory.md, 3.4). Friction that only stops
-    the velocity would let a particle creep by what others pull at it in each step.
+    Friction acts like a spring with a slider: it is the stiffness of the push times the slip, and at most the
+    coefficient times the push (Cundall and Strack 1979; docs/theory.md, 3.4). Friction that only stops the velocity
+    would let a particle creep under the forces of other particles in each step.
 
-    kick: the time of the last motion, s; counts: whether the particle remembers its slip after that motion.
+    Args:
+        kick: duration of the last motion, s.
+        counts: whether the slip after that motion is stored.
     """
     d = ti.static(group.dimension)
     row, F = group.row(p), group.stored(p)
@@ -115,7 +118,7 @@ def friction_of_walls(particles: ti.template(), group: ti.template(), p: int, ki
         side = ti.static(particles.friction.faces[f][1])
         overlap, meets = overlap_of(particles, group.x[p], group.initial[p], stretch_along(F, a), spacing, (a, side))
         if meets:
-            # The slip by now: with that before the last motion the spring would lag behind, and feed vibrations.
+            # The current slip. With the slip before the last motion the spring would lag behind and amplify vibrations.
             slip, length = ti.Vector.zero(float, d), 0.0
             along = ti.Vector.zero(float, d)
             for k in ti.static(range(len(particles.moving.faces))):
@@ -131,7 +134,7 @@ def friction_of_walls(particles: ti.template(), group: ti.template(), p: int, ki
                 slip *= allowed / length
             for c in ti.static(range(d)):
                 total[c] -= stiffness * slip[c]
-                # In an edge the wall that lets it slip less counts. Away from walls nothing is remembered.
+                # In an edge between walls the larger slip per axis is stored. Away from walls the slip is zero.
                 if ti.abs(slip[c]) > ti.abs(kept[c]):
                     kept[c] = slip[c]
     if counts:
@@ -140,10 +143,10 @@ def friction_of_walls(particles: ti.template(), group: ti.template(), p: int, ki
     return total
 
 
-# Edge of a bin, cells; cells that particles may move until they are put into bins anew.
+# Edge of a bin, and largest displacement of particles before they are sorted into bins again, cells.
 BIN, DRIFT = 2, 0.2
-# Distance at which two particles begin to repel each other, in spacings: forces of a row of particles, which sum over
-# some of them, then hardly depend on the place along the row.
+# Distance from which two particles repel each other, in spacings. The force of a row of particles is then a sum over
+# several of them and hardly depends on the position along the row.
 RANGE = 1.5
 EMPTY, SEVERAL = -1, -2
 
@@ -151,29 +154,30 @@ EMPTY, SEVERAL = -1, -2
 def contact_between(
     groups: Sequence[ParticleArrays], bodies: Sequence[int], grid: Grid, backend: Backend, runs: int = 1
 ) -> "ParticleContact | None":
-    """Return the contact of a scene with so many bodies in each group, None where there is none."""
+    """Return the contact of a scene with these numbers of bodies per group, or None without contact."""
     if not groups[0].total or max(bodies) < 2:
         return None
     if not backend.on_cpu:
         raise InputError(
-            f'solver.solids = "total" computes several bodies on the CPU only; found {backend.arch}: take --arch cpu'
+            f'solver.solids = "total" supports several bodies only on the CPU, not on {backend.arch}; use --arch cpu'
         )
     return ParticleContact(grid, groups[0], runs)
 
 
 def bins_along(cells: Sequence[int]) -> tuple[int, ...]:
-    """Return the bins per axis of a domain, a margin of one on each side included."""
+    """Return the number of bins per axis of a domain, including a margin of one on each side."""
     return tuple(n // BIN + 3 for n in cells)
 
 
 @ti.data_oriented
 class ParticleContact:
-    """Which particles are where, for the bodies of one law of each run.
+    """Bins of the particles of one law of each run, and the repulsion between their bodies.
 
     Attributes:
-        first: of each bin, its first particle; following: of each particle, the next one in its bin; EMPTY for none.
-        owner: of each bin, the body that its particles belong to, EMPTY, or SEVERAL.
-        meets: of each particle, whether another body is in its bin or beside it.
+        first: first particle of each bin, or EMPTY.
+        following: next particle in the bin of each particle, or EMPTY.
+        owner: body of the particles of each bin, EMPTY, or SEVERAL.
+        meets: whether another body is in the bin of each particle or in a neighbouring bin.
     """
 
     def __init__(self, grid: Grid, group: ParticleArrays, runs: int) -> None:
@@ -195,7 +199,7 @@ class ParticleContact:
 
     @ti.func
     def bin_of(self, x: ti.template(), spacing: float, run: int):
-        """Return the bin at a place, as a linear index."""
+        """Return the linear index of the bin of a position."""
         index = 0
         for a in ti.static(range(self.dimension)):
             along = ti.cast(x[a] / (BIN * spacing), int) + 1
@@ -204,7 +208,7 @@ class ParticleContact:
 
     @ti.func
     def fill(self, run: int, first: int, count: int, spacing: float):
-        """Put the particles of a run into bins, the last one of a bin first; done by one thread."""
+        """Insert the particles of a run into bins, the last one first in its bin; on one thread."""
         for k in range(run * ti.static(self.count), (run + 1) * ti.static(self.count)):
             self.first[k] = EMPTY
             self.owner[k] = EMPTY
@@ -228,8 +232,8 @@ class ParticleContact:
 
     @ti.func
     def offset(self, beside: int):
-        """Return the difference of linear indices to the bin beside of that number, below 3^d."""
-        # A loop that is not unrolled: 27 copies of what it does would take a minute to compile.
+        """Return the difference of linear indices to the neighbouring bin with number `beside`, below 3^d."""
+        # The loops over neighbouring bins are not unrolled: 27 copies of their bodies would take a minute to compile.
         result, rest, stride = 0, beside, 1
         for b in ti.static(range(self.dimension)):
             result += (rest % 3 - 1) * stride
@@ -239,12 +243,12 @@ class ParticleContact:
 
     @ti.func
     def push(self, group: ti.template(), p: int, spacing: float, run: int):
-        """Return the acceleration of particle p by those of other bodies, m/s^2."""
+        """Return the acceleration of particle p by particles of other bodies, m/s^2."""
         d = ti.static(self.dimension)
         force = ti.Vector.zero(float, d)
         if self.meets[p] == 1:
             x, own = group.x[p], self.stiffness(group, p, spacing)
-            # Bins are those of the last sort. Particles have moved by less than DRIFT cells since.
+            # The bins are those of the last sort; particles have moved by less than DRIFT cells since.
             k = self.bin_of(x, spacing, run)
             for beside in range(ti.static(3**self.dimension)):
                 q = self.first[k + self.offset(beside)]
@@ -268,7 +272,7 @@ class ParticleContact:
 
     @ti.func
     def extent(self, group: ti.template(), p: int, n: ti.template()):
-        """Return the spacing of particle p along n, m: s |F^T n|."""
+        """Return the spacing of particle p along n, s |F^T n|, m."""
         return self.spacing_of(group, p) * (group.stored(p).transpose() @ n).norm()
 
     @ti.func

@@ -1,12 +1,12 @@
-"""Numbers that expressions in kernels read of a run: constants, and means over the kick of what depends on time alone.
+"""Numbers of a run for expressions in kernels: constants, and means over the kick of values that depend only on time.
 
-Means are differences of integrals in tables. The host fills the table of a run with the windows that come next
-(`scene.quadrature.Mean`); the kernel stops where a kick would end beyond them. As constants are no part of kernels,
-runs share them.
+Means are differences of integrals in tables. The host fills the table of a run with the next windows
+(`scene.quadrature.Mean`); the kernel stops before a kick that would end beyond them. Constants are not part of kernels,
+so that runs share kernels.
 
-Each node of a tree is an object whose `evaluate` is inlined where it is called. Conditions are integers, 0 or 1, or for
-a condition of time the share of the kick for which it holds. Both branches of `a if c else b` are computed. KERNELS has
-the names of `scene.functions`, and agrees with numpy to rounding.
+Each node of a tree is an object whose `evaluate` is inlined by its caller. Conditions are integers, 0 or 1, or for a
+condition on time the fraction of the kick for which it holds. Both branches of `a if c else b` are evaluated. KERNELS
+has the names of `scene.functions`; its functions agree with NumPy to rounding.
 """
 
 import math
@@ -22,22 +22,23 @@ from mpmcli.quick_taichi import ti
 from mpmcli.scene.expression import INITIAL, POSITION, Apply, Name, Number, Tree, names_in
 from mpmcli.scene.quadrature import BOUND, COEFFICIENTS, COLUMNS, HALF, LOW, MIDDLE, WINDOWS, Mean, telling_times
 
-# Whole exponents up to this one are products: a power of a negative number is undefined on some devices.
+# Integer powers up to this exponent are computed as products, because powers of negative numbers are undefined on some
+# devices.
 LARGEST_PRODUCT = 64
 
 
 @dataclass(frozen=True)
 class Place:
-    """A leaf of a tree for kernels: a number that they read, by its index among those of the run."""
+    """A leaf of a tree for kernels: the index of a number of the run."""
 
     index: int
 
 
 class Entries:
-    """The numbers of a run in the order of their places, `found`: constants, and trees of t, whose means count."""
+    """The numbers of a run, in order in `found`: constants, and trees of t, which are averaged."""
 
     def __init__(self, origin: Sequence[float]) -> None:
-        """Begin without any; coordinates of expressions are relative to `origin`, (d,), m."""
+        """Start without numbers; `origin`, (d,), m, is added to the coordinates in expressions."""
         self.found: list[float | Tree] = []
         self._origin = tuple(origin)
 
@@ -50,7 +51,7 @@ class Entries:
         return Place(len(self.found) - 1)
 
     def placed(self, tree: Tree) -> "Tree | Place":
-        """Return a tree for `node_of`: what depends on time alone is a place, and so are constants."""
+        """Return a tree for `node_of`, with places for constants and for subtrees that depend only on time."""
         names = names_in(tree)
         if names == {"t"}:
             if tree not in self.found:
@@ -63,7 +64,7 @@ class Entries:
         function, arguments = tree.function, tree.arguments
         if whole_power(tree) is not None:
             return Apply(function, (self.placed(arguments[0]), arguments[1]))
-        # A condition of time may hold for a part of the kick.
+        # A condition on time may hold for a part of the kick.
         if function == "if" and "t" in names_in(arguments[0]):
             function = "blend"
         return Apply(function, tuple(self.placed(argument) for argument in arguments))
@@ -74,7 +75,7 @@ class Entries:
 
 
 def whole_power(tree: Apply) -> int | None:
-    """Return the exponent of a power that is a product, None of anything else."""
+    """Return the exponent of a power that is computed as a product, None for other trees."""
     if tree.function in ("**", "pow") and isinstance(tree.arguments[1], Number):
         exponent = tree.arguments[1].value
         if exponent == int(exponent) and abs(exponent) <= LARGEST_PRODUCT:
@@ -84,7 +85,7 @@ def whole_power(tree: Apply) -> int | None:
 
 @ti.data_oriented
 class DeviceValues:
-    """The numbers of some runs on the device: `field`, (runs, k)."""
+    """The numbers of some runs on the device, in `field`, (runs, k)."""
 
     def __init__(self, runs: int, width: int) -> None:
         self.field = ti.field(float, shape=(runs, max(1, width)))
@@ -97,12 +98,18 @@ class DeviceValues:
 
 
 class RunValues:
-    """The numbers of one run, as the host sets them; timed: whether any of them depends on time."""
+    """The numbers of one run, set by the host.
+
+    Attributes:
+        entries: constants and trees of the numbers.
+        means: `Mean` of each number that depends on time, by index.
+        timed: whether any number depends on time.
+    """
 
     def __init__(
         self, values: DeviceValues, run: int, entries: Sequence[float | Tree], pause: float, end: float
     ) -> None:
-        """Set them as of time 0, of a run of `end` seconds with frames every `pause` seconds."""
+        """Set the numbers at time 0 for a run of `end` seconds with frames every `pause` seconds."""
         self._values, self._run, self.entries = values, run, tuple(entries)
         self._constants = np.array([entry if isinstance(entry, float) else 0.0 for entry in entries])
         self.means = {k: Mean(entry, pause, end) for k, entry in enumerate(entries) if not isinstance(entry, float)}
@@ -118,17 +125,22 @@ class RunValues:
         self._values.write(self._run, numbers.astype(self._values.real))
 
     def telling_times(self, start: float, end: float) -> list[float]:
-        """Return the times between two (s) at which any of the values is smallest or largest."""
+        """Return the times between `start` and `end`, s, of extrema of any value."""
         return [time for tree in self._trees for time in telling_times(tree, start, end)]
 
 
-# Rows for each number of a run, and windows that are filled at once.
+# Rows per number of a run, and windows filled at a time.
 ROOM, AHEAD = 4096, 8
 
 
 @ti.data_oriented
 class TimeTables:
-    """Tables of the numbers of some runs that depend on time: `rows`, (runs * numbers, ROOM), some `used`."""
+    """Tables of the time-dependent numbers of some runs.
+
+    Attributes:
+        rows: (runs * numbers, ROOM) rows of the tables.
+        used: (runs * numbers) int, number of rows in use.
+    """
 
     def __init__(self, runs: int, numbers: int) -> None:
         self._numbers = numbers
@@ -136,9 +148,9 @@ class TimeTables:
         self.used = ti.field(int, shape=runs * numbers)
 
     def fill(self, run: int, means: Sequence[Mean], since: float, *, coarse: bool) -> float:
-        """Fill the tables of a run with the windows from a time, s, on; return that up to which kernels may take means.
+        """Fill the tables of a run with windows from `since`, s, on; return the time up to which means are available.
 
-        coarse: whether room must be found for more windows than a step spans, with fewer rows for each.
+        `coarse` is whether to store more windows than a step spans, with fewer rows for each.
         """
         ahead = 2 * WINDOWS if coarse else AHEAD
         horizon = math.inf
@@ -194,7 +206,7 @@ class TimeTables:
 
     @ti.func
     def largest(self, table: int, start: ti.f64, end: ti.f64):
-        """Return a bound on |value| between two times, s; what lies beyond the table does not count."""
+        """Return a bound on |value| between two times, s; times beyond the table are ignored."""
         q = self.part(table, start)
         result = self.rows[table, q][BOUND]
         for k in range(q + 1, self.part(table, end) + 1):
@@ -203,19 +215,19 @@ class TimeTables:
 
 
 def _integral(row: np.ndarray) -> float:
-    """Return the integral to the end of a row, from the start of its window."""
+    """Return the integral from the start of the window to the end of a row."""
     return float(row[COEFFICIENTS:].sum())
 
 
 def subsampled(rows: np.ndarray, most: int) -> np.ndarray:
-    """Return at most so many rows for those of a window: neighbours are joined, and the integral is linear in each."""
+    """Return at most `most` rows for a window: neighbouring rows are merged, with a linear integral in each."""
     if len(rows) <= most:
         return rows
     first = np.arange(0, len(rows), -(-len(rows) // most))
     end = rows[-1, MIDDLE] + rows[-1, HALF]
     low = rows[first, LOW]
     high = np.append(low[1:], end)
-    # The integral at the start of each, by its polynomial at -1.
+    # The integral at the start of each row, by its polynomial at -1.
     signs = (-1.0) ** np.arange(COLUMNS - COEFFICIENTS)[::-1]
     before = rows[first, COEFFICIENTS:] @ signs
     after = np.append(before[1:], _integral(rows[-1]))
@@ -236,7 +248,7 @@ def _power(a, b):
     size = ti.pow(ti.abs(a), b)
     odd = b - 2.0 * ti.floor(0.5 * b) == 1.0
     whole = ti.select(odd, -size, size)
-    # The root of a negative number is not a number.
+    # The square root of a negative number is NaN.
     negative = ti.select(ti.floor(b) == b, whole, ti.sqrt(a))
     return ti.select(a < 0.0, negative, size)
 
@@ -261,12 +273,12 @@ def _choose(condition, a, b):
 
 @ti.func
 def _blend(share, a, b):
-    """Return a, b, or their mean where a condition holds for a share of the kick between 0 and 1."""
-    # A branch that does not count may be infinite.
+    """Return a, b, or their weighted mean if a condition holds for a fraction `share` of the kick."""
+    # An unused branch may be infinite.
     return ti.select(share >= 1, a, ti.select(share <= 0, b, share * a + (1 - share) * b))
 
 
-# By atan2: a device's own asin and acos may be no better than 1e-4.
+# By atan2, because asin and acos of some devices are accurate only to 1e-4.
 @ti.func
 def _asin(a):
     return ti.atan2(a, ti.sqrt((1.0 - a) * (1.0 + a)))
@@ -287,7 +299,7 @@ def _sinh(a):
     grown = ti.exp(ti.abs(a))
     size = 0.5 * (grown - 1.0 / grown)
     if ti.abs(a) < 0.1:
-        # The first terms of its series: the difference above cancels.
+        # The first terms of the series, because the difference above cancels.
         square = a * a
         size = ti.abs(a) * (1.0 + square / 6.0 * (1.0 + square / 20.0 * (1.0 + square / 42.0 * (1.0 + square / 72.0))))
     return ti.select(a < 0.0, -size, size)
@@ -342,7 +354,7 @@ KERNELS: dict[str, Callable] = {
     "or": ops.max,
     "not": _not,
     "if": _choose,
-    # A condition of time.
+    # A condition on time.
     "blend": _blend,
     "clamp": _clamp,
     "hypot": _hypot,
@@ -364,7 +376,7 @@ KERNELS |= {
 
 @ti.data_oriented
 class Coordinate:
-    """A coordinate of the position, or of the initial one."""
+    """A coordinate of the position or of the initial position."""
 
     def __init__(self, axis: int, *, initial: bool) -> None:
         self.axis, self.initial = axis, initial
@@ -379,7 +391,7 @@ class Coordinate:
 
 @ti.data_oriented
 class Reading:
-    """A number of the run; of a condition of time the share of the kick for which it is true."""
+    """A number of the run; for a condition on time, the fraction of the kick for which it holds."""
 
     def __init__(self, values: DeviceValues, index: int) -> None:
         self.values, self.index = values, index
@@ -391,7 +403,7 @@ class Reading:
 
 @ti.data_oriented
 class Power:
-    """A whole power, by squaring."""
+    """An integer power, by repeated squaring."""
 
     def __init__(self, base: object, exponent: int) -> None:
         self.base, self.inverse = base, exponent < 0
@@ -412,7 +424,7 @@ class Power:
 
 @ti.data_oriented
 class Application:
-    """A function of the values of other nodes."""
+    """A function applied to the values of other nodes."""
 
     def __init__(self, function: Callable, *arguments: object) -> None:
         self.function, self.arguments = function, arguments

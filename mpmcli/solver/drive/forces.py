@@ -1,8 +1,8 @@
-"""Gravity, which may depend on time, and external forces, which are expressions; and bounds on them for the step.
+"""Gravity and external forces given by expressions, and their bounds for the time step.
 
-They advance the velocity from the middle of the last step to that of this one, which moves particles to x_(n+1)
-(docs/theory.md, 6.5 and 7.1). Leapfrog evaluates a force at x_n; what depends on time alone is its mean over that time.
-Gravity acts on the nodes; a force acts on its particles, before their momentum is scattered.
+They advance the velocity from the middle of the previous step to the middle of this one, which moves particles to
+x_(n+1) (docs/theory.md, 6.5 and 7.1). Leapfrog evaluates a force at x_n; a value that depends only on time is averaged
+over this interval. Gravity acts on nodes. A force acts on particles before their momentum is scattered.
 """
 
 import math
@@ -22,17 +22,17 @@ from mpmcli.solver.machine.backend import Backend
 from mpmcli.solver.particles.arrays import ParticleArrays
 from mpmcli.solver.particles.state_bounds import build_maxima
 
-# Half of the distance of the differences for the slope of a force, cells.
+# Half of the interval of the central differences for the gradient of a force, cells.
 REACH = 0.5
-# A slope beyond this counts as zero, as does NaN where a force is undefined next to a particle.
+# A gradient beyond this counts as zero, like NaN where a force is undefined next to a particle.
 STEEPEST = 1e30
-# Forces are measured with the state, for the steps up to the next measurement: at INSTANTS times where they depend on
-# time, and where what depends on time alone is smallest and largest. MARGIN allows for the motion of the particles in
-# between.
+# Forces are measured together with the state, for the steps until the next measurement. Forces that depend on time are
+# measured at INSTANTS times and at the extrema of values that depend only on time. MARGIN is the safety factor for the
+# motion of particles in between.
 INSTANTS = 5
 MARGIN = 1.5
 
-# Measurement of the force on particles, from the first one, their number, and that of the run; see `build_push`.
+# Measurement of the force on particles, given the first particle, their number, and the run; see `build_push`.
 Push = Callable[[int, int, int], tuple[float, float]]
 
 
@@ -53,7 +53,12 @@ def needs_initial(scene: Scene, names: Sequence[str]) -> bool:
 
 @dataclass(frozen=True)
 class Term:
-    """A force on the body at a place in its group, -1 for all of them: each axis along which it acts, with its tree."""
+    """A force on one body of a group.
+
+    Attributes:
+        place: index of the body in its group, -1 for all bodies.
+        axes: each axis along which the force acts, with its tree.
+    """
 
     place: int
     axes: tuple[tuple[int, Tree | Place], ...]
@@ -61,11 +66,12 @@ class Term:
 
 @dataclass(frozen=True)
 class ForceTerms:
-    """Forces on particles of one law, or on rigid bodies, as a kernel computes them; where equal, runs share kernels.
+    """Forces on particles of one law, or on rigid bodies, as compiled; runs with equal terms share kernels.
 
     Attributes:
+        terms: the forces.
         moves, initial: whether any of them depends on the position, and on the initial position.
-        reach, slope: half of the distance of differences, m, and the inverse of the distance; None without forces.
+        reach, slope: half of the interval of differences, m, and the inverse of the interval, 1/m; None without forces.
     """
 
     terms: tuple[Term, ...] = ()
@@ -76,7 +82,7 @@ class ForceTerms:
 
     @staticmethod
     def of(scene: Scene, names: Sequence[str], entries: Entries) -> "ForceTerms":
-        """Return the forces on some bodies, with the numbers that they add to `entries`."""
+        """Return the forces on some bodies; their numbers are added to `entries`."""
         forces = forces_on(scene, names)
         if not forces or not names:
             return ForceTerms()
@@ -98,13 +104,16 @@ class ForceTerms:
 
 @dataclass(frozen=True)
 class Drives:
-    """Gravity and forces as the kernels of a batch compute them; runs for which they are equal share kernels.
+    """Gravity and forces as compiled; runs with equal ones share kernels.
 
     Attributes:
-        gravity: along each axis, of the numbers of a run; nothing where it is steady. forces: on each law.
-        motions: of each collider that moves, for velocity and spin the place of what depends on time, None of others.
-        rigid: on rigid bodies; motors: (which of them, rate).
-        timed: of each number of a run whether it depends on time.
+        gravity: gravity along each axis, as numbers of a run; empty if it is steady.
+        forces: forces on the particles of each law.
+        motions: per moving collider, the places of those components of velocity and spin that depend on time, None for
+            constant ones.
+        rigid: forces on rigid bodies.
+        motors: (index of the rigid body, rate) of each motor.
+        timed: whether each number of a run depends on time.
     """
 
     gravity: tuple[Place, ...]
@@ -116,7 +125,7 @@ class Drives:
 
     @staticmethod
     def of(scene: Scene, members: Sequence[Sequence[int]]) -> "tuple[Drives, list[float | Tree]]":
-        """Return those of a scene, and its numbers; `members` are the indices of the bodies of each law."""
+        """Return the drives of a scene and its numbers; `members` are the indices of the bodies of each law."""
         entries = Entries(scene.domain.origin)
         steady = scene.domain.steady
         gravity = () if steady else tuple(entries.placed(tree_of(entry)) for entry in scene.domain.gravity)
@@ -132,20 +141,23 @@ class Drives:
 
 @ti.data_oriented
 class DriveValues:
-    """The numbers of all runs on the device, and what depends on time in tables.
+    """The numbers of all runs on the device, with tables of those that depend on time.
 
-    device: the numbers; tables: of those that depend on time, None where none does, or without double precision;
-    of_runs: the same on the host; gravity_varies: whether gravity is among them.
+    Attributes:
+        device: the numbers.
+        timed: (table, index) of each number that depends on time.
+        tables: tables of these numbers; None if there are none, or without double precision.
+        of_runs: the numbers of each run on the host.
+        motions: (moving collider, component of its rates, table) of each rate that depends on time.
+        gravity_varies: whether gravity varies.
     """
 
     def __init__(self, drives: Drives, runs: int, *, doubles: bool = True) -> None:
         timed = [k for k, depends in enumerate(drives.timed) if depends]
         self.device = DeviceValues(runs, len(drives.timed))
-        # Each number that depends on time, with its table.
         self.timed = tuple(enumerate(timed))
         self.tables = TimeTables(runs, len(timed)) if timed and doubles else None
         self.of_runs: list[RunValues | None] = [None] * runs
-        # Of the colliders that move: (which, of velocity and spin which, table).
         self.motions = tuple(
             (m, a, timed.index(leaf.index))
             for m, places in enumerate(drives.motions)
@@ -159,7 +171,7 @@ class DriveValues:
 
     @ti.func
     def set_means(self, w: int, start: ti.f64, end: ti.f64):
-        """Set what depends on time in a run to its means over a kick."""
+        """Set the numbers of a run that depend on time to their means over a kick."""
         for table, k in ti.static(self.timed):
             row = w * ti.static(len(self.timed)) + table
             self.device.field[w, k] = ti.cast(self.tables.mean(row, start, end), float)
@@ -185,7 +197,7 @@ class DriveValues:
 
 
 class HostValues:
-    """What `DriveValues` computes in kernels, on the host, where devices without double precision need it."""
+    """Host version of the kernel functions of `DriveValues`, for devices without double precision."""
 
     motions = ()
 
@@ -193,7 +205,7 @@ class HostValues:
         self._values, self.gravity_varies = values, values.gravity_varies
 
     def set_means(self, w: int, start: float, end: float) -> None:
-        """Set what depends on time in a run to its means over a kick."""
+        """Set the numbers of a run that depend on time to their means over a kick."""
         if self._values.timed:
             self._values.of_runs[w].write(start, end)
 
@@ -205,7 +217,7 @@ class HostValues:
 
 @ti.data_oriented
 class Gravity:
-    """Gravity where it varies: numbers of the run."""
+    """Varying gravity, read from the numbers of a run."""
 
     def __init__(self, places: Sequence[Place], zero: Sequence[float], values: DeviceValues) -> None:
         self.dimension, self.values = len(zero), values
@@ -220,7 +232,7 @@ class Gravity:
 
 
 def _nodes_of(forces: ForceTerms, values: DeviceValues) -> tuple[tuple[int, tuple[tuple[int, object], ...]], ...]:
-    """Return of each force its body, and each axis along which it acts with the node that evaluates it."""
+    """Return per force the index of its body, and each axis along which it acts with the node that evaluates it."""
     return tuple(
         (term.place, tuple((axis, node_of(tree, values)) for axis, tree in term.axes)) for term in forces.terms
     )
@@ -230,12 +242,13 @@ def _nodes_of(forces: ForceTerms, values: DeviceValues) -> tuple[tuple[int, tupl
 class GroupForce:
     """All forces on one group of particles.
 
-    spreads: whether their slope is known: they depend on the position, and none on the initial position, whose own
-    slope is that of the motion so far.
+    Attributes:
+        spreads: whether the gradient of the forces is known: at least one depends on the position and none on the
+            initial position, whose gradient would require that of the motion so far.
     """
 
     def __init__(self, dimension: int, forces: ForceTerms, values: DeviceValues, room: int) -> None:
-        """Build the nodes; `room` is the number of bodies that each run may have in the group."""
+        """Build the nodes; `room` is the capacity for bodies per run in the group."""
         self.dimension, self.terms = dimension, _nodes_of(forces, values)
         self.moves, self.spreads = forces.moves, forces.moves and not forces.initial
         self.reach, self.slope = node_of(forces.reach, values), node_of(forces.slope, values)
@@ -256,10 +269,10 @@ class GroupForce:
 
     @ti.func
     def acceleration(self, group: ti.template(), p: int, with_slope: ti.template()):
-        """Return the acceleration a of particle p, and its slope da/dx, d x d, at fixed X: zeros without `with_slope`.
+        """Return the acceleration a of particle p and da/dx at fixed X, d x d, which is 0 without `with_slope`.
 
-        Central differences at the scale of the grid are exact where a is quadratic in x: a force that is linear in x
-        drives a body affinely up to its surface.
+        Central differences at the scale of the grid are exact if a is quadratic in x. With a force linear in x a body
+        moves affinely up to its surface.
         """
         d = ti.static(self.dimension)
         x, X, a = ti.Vector.zero(float, d), ti.Vector.zero(float, d), ti.Vector.zero(float, d)
@@ -271,7 +284,8 @@ class GroupForce:
                 X[c] = group.initial[p][c]
         if ti.static(self.moves and with_slope):
             reach, inverse = self.reach.evaluate(x, X, group.run), self.slope.evaluate(x, X, group.run)
-            # In a loop, so that the expressions are compiled once: up and down along each axis, then in place.
+            # A loop, so that the expressions are compiled once: forwards and backwards along each axis, then at x
+            # itself.
             for k in range(2 * d + 1):
                 place = x
                 for b in ti.static(range(d)):
@@ -296,7 +310,7 @@ class GroupForce:
 
 @ti.data_oriented
 class RigidDrive:
-    """Forces on rigid bodies, as accelerations of their centres, and the rates that their motors keep."""
+    """Forces on rigid bodies, as accelerations of their centres, and the prescribed rates of their motors."""
 
     def __init__(self, dimension: int, drives: Drives, values: DeviceValues) -> None:
         self.dimension, self.terms = dimension, _nodes_of(drives.rigid, values)
@@ -304,7 +318,7 @@ class RigidDrive:
 
     @ti.func
     def acceleration(self, j: int, x: ti.template(), X: ti.template(), run: int):
-        """Return the acceleration of the j-th body with its centre at x, at the start at X."""
+        """Return the acceleration of the j-th body with its centre at x, initially at X."""
         result = ti.Vector.zero(float, self.dimension)
         for place, axes in ti.static(self.terms):
             if place < 0 or place == j:
@@ -314,7 +328,7 @@ class RigidDrive:
 
     @ti.func
     def motor(self, j: int, run: int):
-        """Return the rate that the motor of the j-th body keeps."""
+        """Return the prescribed rate of the motor of the j-th body."""
         result = 0.0
         nowhere = ti.Vector.zero(float, self.dimension)
         for which, node in ti.static(self.motors):
@@ -353,7 +367,7 @@ def build_push(group: ParticleArrays, backend: Backend) -> Push:
 def push_on(
     group: ParticleArrays, forces: ForceTerms, room: int, values: DeviceValues, backend: Backend
 ) -> Push | None:
-    """Let forces act on a group, before kernels are built; return their measurement, see `build_push`."""
+    """Assign forces to a group, before kernels are built; return their measurement, see `build_push`."""
     if not forces.terms:
         return None
     group.push_by(GroupForce(group.dimension, forces, values, room))
@@ -361,19 +375,20 @@ def push_on(
 
 
 class ExternalForces:
-    """Measurements of the force on each group that one acts on.
+    """Measurements of the forces on all groups with forces.
 
-    pushes: whether there are any.
+    Attributes:
+        pushes: whether there are any forces.
     """
 
     def __init__(self, values: RunValues, measures: Sequence[Callable[[], tuple[float, float]]]) -> None:
         self._values, self._measures, self.pushes = values, measures, bool(measures)
 
     def measure(self, time: float, ahead: float) -> tuple[float, float]:
-        """Measure where the particles are, from a time on up to the next measurement, `ahead` s later.
+        """Measure forces at the current positions, from `time` until the next measurement, `ahead` s later.
 
         Returns:
-            The largest force over mass, m/s^2, and the largest row sum of its slope |da/dx|, 1/s^2, margin included.
+            The largest force per mass, m/s^2, and the largest row sum of |da/dx|, 1/s^2, including the margin.
         """
         times = [time]
         if self._values.timed and ahead > 0:

@@ -1,4 +1,4 @@
-"""One run or many in one process: what they share on the device."""
+"""One or several runs in one process, and their shared data on the device."""
 
 import sys
 import time
@@ -49,29 +49,32 @@ from mpmcli.solver.transfer.redistribution import FineBlocks, FineGrid
 from mpmcli.solver.transfer.splines import PAD, scheme_of
 from mpmcli.solver.transfer.volume import averages_volume
 
-# Room for blocks of a sparse grid, of those that particles reach, when there are more of them than fit.
+# Factor from the required to the allocated blocks when a sparse grid is enlarged.
 GROWTH = 2
-# Taichi inlines functions, and trees of expressions, recursively, about 20 calls deep for each level.
+# Taichi inlines functions and trees of expressions recursively, with about 20 Python calls per level.
 RECURSION = 4000
 
 
 class Batch:
-    """Room on the device for some runs of one kind, and the kernels that advance them.
+    """Device data for some runs of one kind, and the kernels that advance them.
 
     Attributes:
-        kind: what was compiled, with the room for each run.
+        kind: the compiled kind, with the capacity per run.
         runs: number of runs.
-        device: all of it.
+        device: the data on the device.
         layout: columns of `numbers`, (runs, k) float64, and `counts`, (runs, l) int32, see `run_state`.
-        frame_buffer: what particles show at the frames that the last launch recorded, on the CPU: (rows, k), as many
-            rows for each run.
-        frame_stats: of each of these frames FRAME_NUMBERS, and sums of each law, (runs, MOST_FRAMES, k), float64.
-        values: numbers that expressions read; steps: what chooses steps, on the host.
-        cpu, gpu: what launches steps, there or there; launch_cpu: the kernel of the one, compiled or stored.
-        profile: where a Counter is put here, phases of the only run are launched one by one on the CPU, and their wall
-            time is added by their names, s.
-        pushes: measurements of the forces on each law, None where there are none.
-        seconds: wall time of all launches; first_seconds: of the first, which compiles the kernel.
+        frame_buffer: on the CPU, particle data of the frames recorded in the last launch, (rows, k), with an equal
+            number of rows per run.
+        frame_stats: FRAME_NUMBERS, sums of each law and loads of each of these frames, (runs, MOST_FRAMES, k), float64.
+        values: numbers for expressions.
+        steps: choice of steps on the host.
+        cpu, gpu: launcher of steps on the CPU or on a GPU.
+        launch_cpu: the kernel of `cpu`, compiled or stored.
+        profile: if set to a Counter, the phases of the only run are launched one by one on the CPU, and their wall
+            times, s, are added by name.
+        pushes: measurement of the forces on each law, None without forces.
+        seconds: wall time of all launches, s.
+        first_seconds: wall time of the first launch, which compiles the kernel, s.
     """
 
     def __init__(self, kind: CompiledKind, backend: Backend, runs: int = 1) -> None:
@@ -82,9 +85,9 @@ class Batch:
         require_cpu_if_sparse(kind.settings, backend)
         if (kind.colliders.moving or kind.colliders.free) and not backend.doubles:
             raise InputError(
-                f"colliders that move need double precision, which --arch {backend.arch} lacks; give --arch cpu"
+                f"moving colliders need double precision, which --arch {backend.arch} lacks; use --arch cpu"
             )
-        # Many small runs on a GPU are in its cache, and use all nodes of their domains.
+        # Many small runs on a GPU fit its cache; they are not sorted and use all nodes of their domains.
         sorts = on_cpu or runs == 1 or kind.inflow.any or kind.layers.separate
         scheme = scheme_of(kind.settings, keeps_flip_velocity=kind.keeps_motion)
         averaged = [averages_volume(kind.settings, law) for law in kind.members]
@@ -97,7 +100,7 @@ class Batch:
                 d,
                 runs * capacity,
                 (runs * bodies, CONSTANTS + len(law.constants(law.members[0]))),
-                # Forces of a batch select the particles of their body.
+                # Forces select the particles of their body.
                 many_bodies=runs > 1 or bodies > 1 or bool(forces.terms),
                 serial=on_cpu and backend.threads == 1,
                 keeps_initial=forces.initial,
@@ -186,17 +189,17 @@ class Batch:
             self.gpu = GpuLaunch(self.device, self.layout, doubles=backend.doubles)
 
     def _drift_allowed(self, grid: Grid, has_contact: bool) -> float:
-        """Return the cells that particles may drift before they are sorted."""
+        """Return the largest drift of particles before a sort, cells."""
         if has_contact:
             return DRIFT
         if self.backend.on_cpu:
             return drift_allowed(grid.tile, grid.scheme.spline.nodes)
-        # The nodes in use are those that a drift of a tile reaches. One cell is for the last step before a sort; what
-        # passes an open face is retired before it leaves the grid.
+        # The nodes in use include a drift of one tile. One cell is reserved for the last step before a sort; particles
+        # beyond an open face are retired before they leave the grid.
         return BEYOND - 1 if grid.opens else grid.tile - 1.0
 
     def _make_grid(self, period: Period, blocks: int, *, deterministic: bool = False) -> Grid:
-        """Return the grid; on a sparse one there is room for so many blocks."""
+        """Return the grid; a sparse grid is allocated with `blocks` blocks."""
         kind, on_cpu = self.kind, self.backend.on_cpu
         scheme = scheme_of(kind.settings, keeps_flip_velocity=kind.keeps_motion)
         tile = tile_edge(scheme.spline.nodes, kind.dimension, on_cpu=on_cpu)
@@ -228,7 +231,7 @@ class Batch:
         return [kind(group, grid, self._buffers, sharing, self.runs) for group in groups]
 
     def occupy(self, first_nodes: np.ndarray) -> None:
-        """Let a sparse grid have the nodes that particles reach whose stencils begin at these, (n, d) int."""
+        """Number the tiles of a sparse grid reached by particles, given the first nodes of stencils, (n, d) int."""
         grid = self.device.grid
         tiles = tiles_reached(first_nodes, grid.tile, grid.reach)
         if len(tiles) >= grid.tile_count:
@@ -236,16 +239,16 @@ class Batch:
         self.device.grid.occupy(tiles)
 
     def grow(self, blocks: int) -> None:
-        """Make room for GROWTH times so many blocks of a sparse grid. Their numbers are lost: a sort must follow.
+        """Replace a sparse grid by one with GROWTH times `blocks` blocks; a sort, which numbers them, must follow.
 
-        What the grid had stays allocated until the backend stops.
+        The old grid stays allocated until the backend stops.
         """
         device = self.device
         most = most_blocks(device.grid)
         if blocks > most:
             raise RunError(
-                f"the material has spread over {blocks:,} blocks of the sparse grid, and there is memory for {most:,}; "
-                "a larger domain.spacing needs fewer."
+                f"the material has spread over {blocks:,} blocks of the sparse grid, but there is memory for {most:,} "
+                "only; use a larger domain.spacing."
             )
         grid = self._make_grid(device.grid.period, min(GROWTH * blocks, most))
         nodes, particles = copy(device.nodes), copy(device.particles)
@@ -259,11 +262,11 @@ class Batch:
         self.launch_cpu = StoredLaunch(self.cpu, self.kind, self.backend)
 
     def state(self, slot: int | slice) -> RunState:
-        """Return the numbers of a run, or of some runs."""
+        """Return the numbers of one or several runs."""
         return RunState(self.layout, self.numbers, self.counts, slot)
 
     def reserve(self, rows: int, columns: int) -> None:
-        """Let each run have so many rows of `frame_buffer` from the next launch on."""
+        """Allocate `rows` rows of `frame_buffer` per run from the next launch on."""
         shape = max(rows * self.runs, len(self._buffer)), max(columns, self._buffer.shape[1])
         if shape != self._buffer.shape:
             self._buffer = np.empty(shape, self._buffer.dtype)
@@ -273,7 +276,7 @@ class Batch:
         return slot * (len(self.frame_buffer) // self.runs)
 
     def launch(self) -> None:
-        """Advance every run until its host has to attend to it, or its budget of steps is spent."""
+        """Advance every run until it needs its host or its budget of steps is used up."""
         began = time.perf_counter()
         if self.backend.on_cpu:
             self.frame_buffer = self._buffer

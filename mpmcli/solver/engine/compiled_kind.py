@@ -1,4 +1,4 @@
-"""What kinds of runs may share kernels and the device."""
+"""The kind of a run, which determines its compiled kernels."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -21,22 +21,26 @@ from mpmcli.solver.transfer.volume import needs_filling
 
 @dataclass(frozen=True)
 class CompiledKind:
-    """What is compiled for a run. Everything else is data, and runs of one kind share kernels and the device.
+    """Compile-time properties of a run. Everything else is data; runs of one kind share kernels and the device.
 
     Attributes:
-        dimension: 2 or 3; precision: "f32" or "f64".
-        settings: of the solver.
-        faces: words of the walls, per axis; rough, moving: (axis, side) of those with friction, and that move.
-        flags: of each law in the order of their names, the name and the terms that it has.
-        cells: of the domain per axis; particles, bodies: per law. All three are upper bounds.
-        keeps_filling: whether nodes keep the volume scattered to them; fine: fine nodes per cell and axis, or 0.
-        keeps_motion: whether bodies keep shares of what they do, see `kept_motion`.
-        sparse: whether nodes are there where particles are alone, on the CPU, where such runs share nothing.
-        colliders: their forms, and which of them move.
-        drives: gravity that varies, forces, and motions of colliders.
-        inflow: what lets particles come and go.
-        layers: of nodes, for bodies with velocity fields of their own.
-        members: the laws.
+        dimension: 2 or 3.
+        precision: "f32" or "f64".
+        settings: settings of the solver.
+        faces: conditions of the walls per axis.
+        rough, moving: (axis, side) of walls with friction, and of moving walls.
+        flags: name and terms of each law, ordered by name.
+        cells: upper bound of the cells of the domain per axis.
+        particles, bodies: upper bounds of the numbers of particles and bodies per law.
+        keeps_filling: whether nodes store the volume scattered to them.
+        fine: fine nodes per cell and axis, or 0.
+        keeps_motion: whether bodies keep fractions of their motion, see `kept_motion`.
+        sparse: whether the grid is sparse (on the CPU; such runs do not share a batch).
+        colliders: shapes of the colliders, and which of them move.
+        drives: varying gravity, forces, and motions of colliders.
+        inflow: emitters and open faces.
+        layers: layers of nodes for bodies with their own velocity fields.
+        members: the laws, ordered by name.
     """
 
     dimension: int
@@ -61,7 +65,7 @@ class CompiledKind:
 
     @staticmethod
     def of(scene: Scene, particles: Sequence[BodyParticles]) -> "CompiledKind":
-        """Return the kind of a scene with these particles, one entry per body."""
+        """Return the kind of a scene with these particles, one entry per source."""
         names = sorted({body.material.law for body in scene.sources})
         places = [members_of(scene, name) for name in names]
         members = tuple(
@@ -91,7 +95,7 @@ class CompiledKind:
         )
 
     def padded(self) -> "CompiledKind":
-        """Return the kind with some room to spare, so that few sizes occur and compiled kernels are found again."""
+        """Return the kind with padded sizes, so that few sizes occur and compiled kernels are reused."""
         return replace(
             self,
             cells=self.cells if self.sparse else padded_cells(self.cells),
@@ -102,7 +106,7 @@ class CompiledKind:
         )
 
     def joined(self, other: "CompiledKind") -> "CompiledKind | None":
-        """Return the kind that has room for both, None where they need other kernels."""
+        """Return the kind with space for both, or None if they need different kernels."""
         if (self.dimension, self.flags) != (other.dimension, other.flags) or self.sparse != other.sparse:
             return None
         room = {

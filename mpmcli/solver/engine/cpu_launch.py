@@ -1,6 +1,6 @@
-"""Carries out steps on the CPU: a launch takes many steps of each run, and records frames, until its host is needed.
+"""Carries out steps on the CPU: a launch takes many steps of each run and records frames until the host is needed.
 
-A run has the same bytes in any batch and on any number of threads.
+The results of a run are identical in every byte in any batch and on any number of threads.
 """
 
 import time
@@ -35,15 +35,19 @@ from mpmcli.solver.particles.state_bounds import NOTHING, deformation_rate, entr
 from mpmcli.solver.transfer.splines import PAD
 
 FrameStats = ti.types.ndarray(ti.f64, 3)
-# What the profile calls the phases beside those of a step; a sort is any of its phases.
+# Names in the profile of phases outside a step.
 BESIDE = {"forget": "sort", "mark": "sort", "average_shown": "frame", "show": "frame"}
 
 
 @ti.data_oriented
 class CpuLaunch:
-    """The kernels of a batch on the CPU, w being the number of a run; their arrays are those of `Batch`.
+    """The kernels of a batch on the CPU; w is the index of a run, and their arrays are those of `Batch`.
 
-    phases: their bodies; steps: how a step is chosen; team: the threads that share a run.
+    Attributes:
+        phases: bodies of the phases.
+        steps: choice of steps.
+        team: threads that share a run.
+        token: numbers that make the kernel unique for Taichi; see `kernel_store`.
     """
 
     def __init__(self, device: Device, layout: Layout) -> None:
@@ -57,7 +61,6 @@ class CpuLaunch:
         self.alone = device.threads == 1
         self.sum_count = sum_entries(self.dimension)
         self.next_run = ti.field(int, shape=())
-        # Numbers that make this kernel another one for Taichi; see `kernel_store`.
         self.token: tuple[int, ...] = ()
 
     @ti.kernel
@@ -74,10 +77,11 @@ class CpuLaunch:
             if q % CHUNK == 0:
                 w = ti.atomic_add(self.next_run[None], 1)
                 if ti.static(self.phases.shared):
-                    # The first thread to come leads: a system may let threads run one after another.
+                    # The first thread to arrive is the leader, because the operating system may run threads one after
+                    # another.
                     self.advance_run(0, w, numbers, counts, frame_buffer, frame_stats)
                 else:
-                    # Threads take runs as they become free: no number depends on which one.
+                    # Threads take runs as they become free; results do not depend on the thread.
                     while w < self.device.runs:
                         self.advance_run(w, 0, numbers, counts, frame_buffer, frame_stats)
                         w = ti.atomic_add(self.next_run[None], 1)
@@ -92,7 +96,7 @@ class CpuLaunch:
         frame_buffer: ti.template(),
         frame_stats: ti.template(),
     ):
-        """Advance a run, record frames, and measure it where the host needs that; threads but t = 0 only help."""
+        """Advance a run, record frames, and measure it if the host needs that; threads other than t = 0 only help."""
         (run,) = ti.static((self.phases.state(w, numbers, counts),))
         status = run.status
         self.team.enter(w)
@@ -121,7 +125,7 @@ class CpuLaunch:
 
     @ti.func
     def lead(self, run: ti.template(), done: int, frame_stats: ti.template()):
-        """Do what follows on a phase that is done, -1 at the start of a launch; return the next one, -1 for none."""
+        """Do the work after phase `done`, -1 at the start of a launch; return the next phase, -1 for none."""
         phase = done
         if phase < 0:
             self.phases.begin_launch(run)
@@ -155,7 +159,7 @@ class CpuLaunch:
 
     @ti.func
     def begin_step(self, run: ti.template()):
-        """Prepare the step that was chosen."""
+        """Prepare the chosen step."""
         self.find_box(run)
         self.phases.begin_step(run)
 
@@ -177,7 +181,7 @@ class CpuLaunch:
 
     @ti.func
     def sort_on(self, run: ti.template(), phase: int):
-        """Do what follows on a phase of a sort before the next one."""
+        """Do the work between a phase of a sort and the next one."""
         (view,) = ti.static(self.phases.see(run))
         if ti.static(view.grid.sparse):
             if phase == self.phases.marking:
@@ -189,7 +193,7 @@ class CpuLaunch:
 
     @ti.func
     def end_sort(self, run: ti.template()):
-        """Find the range of the stencils of particles that were sorted."""
+        """Find the range of stencils of the sorted particles."""
         low = ti.Vector([2**30] * self.dimension)
         high = ti.Vector([-1] * self.dimension)
         self.emission.count_active(run)
@@ -209,7 +213,7 @@ class CpuLaunch:
             if ti.static(self.phases.shared):
                 self.phases.places.divide(g, own)
         if ti.static(self.device.comes_and_goes):
-            # Where none takes part there is a box all the same.
+            # Without active particles the box must still be valid.
             if high[0] < 0:
                 for a in ti.static(range(self.dimension)):
                     low[a], high[a] = PAD, PAD
@@ -231,19 +235,19 @@ class CpuLaunch:
 
     @ti.func
     def enter(self, run: ti.template()):
-        """Let the sheets of emitters enter that are due."""
+        """Let due sheets of emitters enter."""
         if run.due <= run.time:
             (view,) = ti.static(self.phases.see(run))
             before = run.due
             self.emission.enter(view.orders, run)
             if ti.static(self.device.grid.sparse):
-                # What has come in may reach tiles without a number.
+                # Particles that entered may reach tiles without a number.
                 if run.due != before:
                     run.drift = as_double(self.device.drift_allowed)
 
     @ti.kernel
     def share_work(self, counts: RunInts):
-        """Divide particles among threads anew after they were loaded."""
+        """Divide particles among threads again after loading a state."""
         ti.loop_config(serialize=True)
         for w in range(self.device.runs):
             if ti.static(self.phases.shared):
@@ -253,18 +257,18 @@ class CpuLaunch:
     # Frames.
 
     def takers(self) -> list[tuple[Loads | RigidBodies | BodyContact, int]]:
-        """Return what the statistics of a frame have behind the sums of each group, and from which column on."""
+        """Return the objects with loads in the statistics of a frame, and the first column of each."""
         device, column = self.device, len(FRAME_NUMBERS) + len(self.members) * self.sum_count
         found = []
         if device.colliders is not None:
             found.append((device.colliders.loads, column))
             column += device.colliders.loads.capacity * device.colliders.loads.width
-        # Those that separate and those that move freely are not in one scene.
+        # A scene cannot have both separating bodies and freely moving colliders.
         return found + [(each, column) for each in (device.rigid, device.contact) if each is not None]
 
     @ti.func
     def record(self, run: ti.template(), frame_stats: ti.template()):
-        """Store the statistics of a frame that is shown, and aim at the next one if there is one."""
+        """Store the statistics of a frame, and set the target to the next frame if there is one."""
         frame = run.recorded
         sound = True
         for g, group in ti.static(self.members):
@@ -294,10 +298,10 @@ class CpuLaunch:
             run.status = LOST
 
     def noted(self, run: RunState) -> list[object]:
-        """Return the numbers of a run that a frame takes."""
+        """Return the numbers of a run that are stored with a frame."""
         return [getattr(run, name) for name in FRAME_NUMBERS]
 
-    # The profile: the same phases, a launch for each.
+    # The profile: the same phases, with a launch for each.
 
     def launch_by_phase(
         self,
@@ -307,7 +311,7 @@ class CpuLaunch:
         frame_stats: np.ndarray,
         seconds: Counter,
     ) -> None:
-        """Advance the only run as `launch` does; add the wall time of each phase to `seconds` by its name."""
+        """Advance the only run like `launch`; add the wall time of each phase to `seconds` under its name."""
         run, phase = self.phases.state(0, numbers, counts), -1
         status = run.status
         run.frame_recorded = 0
@@ -324,13 +328,13 @@ class CpuLaunch:
 
     @ti.kernel
     def next_phase(self, phase: int, numbers: RunReals, counts: RunInts, frame_stats: FrameStats) -> int:
-        """Do what follows on a phase of the only run; return the next one."""
+        """Do the work after a phase of the only run; return the next phase."""
         (run,) = ti.static((self.phases.state(0, numbers, counts),))
         return self.lead(run, phase, frame_stats)
 
     @ti.kernel
     def work(self, phase: int, numbers: RunReals, counts: RunInts, frame_buffer: FrameBuffer):
-        """Do all parts of a phase of the only run."""
+        """Process all parts of a phase of the only run."""
         ti.loop_config(serialize=True)
         for _ in range(1):
             self.team.open(0)

@@ -1,10 +1,11 @@
-"""The bodies of the phases on the CPU, a part at a time, and the numbers that threads know phases by.
+"""The bodies of the phases on the CPU, for one part at a time, and the numbering of the phases.
 
-No number depends on who does a part: parts of a phase write disjoint memory, and maxima know no order.
+Results do not depend on which thread processes a part: parts of a phase write disjoint memory, and maxima do not depend
+on the order.
 
-The time to compile a function grows with the square of its length. Each kind of part is therefore in a function of its
-own for Taichi as well (`ti.real_func`). Such a function knows nothing of its caller but its arguments, so that each one
-asks for the numbers of the run anew.
+The time to compile a function grows with the square of its length. Each kind of part is therefore compiled as a
+separate function (`ti.real_func`). Such a function has access only to its arguments, so that each one loads the numbers
+of the run again.
 """
 
 from collections.abc import Callable
@@ -32,19 +33,24 @@ from mpmcli.solver.transfer.cpu_transfers import (
 )
 from mpmcli.solver.transfer.volume import average_for_frame, average_range
 
-# Of all runs: numbers, counts and what particles show, see `Batch`.
+# Arrays of all runs: numbers, counts and frame buffer, see `Batch`.
 RunReals = ti.types.ndarray(ti.f64, 2)
 RunInts = ti.types.ndarray(ti.i32, 2)
 FrameBuffer = ti.types.ndarray(ndim=2)
-# Parts of a loop over the particles or the nodes of a region; on a sparse grid, where parts are whole pencils.
+# Number of parts of a loop over the particles or nodes of a region, on a dense grid and on a sparse grid, where parts
+# are whole pencils.
 SHARES, SPARSE_SHARES = 4, 16
 
 
 class PartKind(NamedTuple):
-    """The parts of some phases that have one body.
+    """Parts of consecutive phases with a common body.
 
-    name: of the phases; group: number of the group of particles. first, after: number of the first phase, and the
-    one after the last. body: name of the method. item: what that does for each node or particle, where it says nothing.
+    Attributes:
+        name: name of the phases.
+        group: index of the group of particles.
+        first, after: number of the first phase, and of the one after the last.
+        body: name of the method.
+        item: function for each node or particle, for methods that only loop.
     """
 
     name: str
@@ -56,41 +62,47 @@ class PartKind(NamedTuple):
 
 
 class Part(Work):
-    """A part that a thread does; atomic: whether sums need atomics, False.
+    """A part of a phase that a thread processes.
 
-    region, part: of the part; t: of the thread; frame_buffer: see `Batch`.
+    Attributes:
+        atomic: whether sums need atomics; False.
+        region, part: index of the region, and of the part in it.
+        t: index of the thread.
+        frame_buffer: see `Batch`.
     """
 
     atomic = False
 
     def __init__(self, view: RunView, kind: PartKind, turn: object, *variables: object) -> None:
-        """Keep a view, and variables of a kernel."""
+        """Store a view and variables of a kernel."""
         super().__init__(view, kind.group, kind.item, turn)
         self.region, self.part, self.t, self.frame_buffer = variables
 
 
 @ti.data_oriented
 class CpuRegions:
-    """The regions of the only run; where there are more runs, each is one region.
+    """The regions of a single run; with several runs, each run is one region.
 
-    regions: their number.
+    Attributes:
+        regions: number of regions.
+        pencils: for each region except the last, the first pencil after it, per group.
+        rows: for each region except the last, the first row of nodes after it.
     """
 
     def __init__(self, device: Device, regions: int) -> None:
         self.device, self.regions, self.dimension = device, regions, device.grid.dimension
         self.groups = tuple(range(len(device.groups)))
-        # Of each region but the last: the first pencil after it, per group, and the first row of nodes after it.
         self.pencils = tuple(ti.field(int, shape=max(regions - 1, 1)) for _ in device.groups)
         self.rows = ti.field(int, shape=max(regions - 1, 1))
 
     @ti.func
     def even_part(self, count: int, region: int):
-        """Return the part of a region in a range of `count`, as its first and the first after it."""
+        """Return the first index of the share of a region in a range of `count`, and the one after the last."""
         return share_start(count, region, self.regions), share_start(count, region + 1, self.regions)
 
     @ti.func
     def rows_of(self, grid: ti.template(), region: int):
-        """Return the first row of nodes of a region, and the first after it."""
+        """Return the first row of nodes of a region, and the one after the last."""
         first, after = 0, grid.row_count()
         if ti.static(grid.sparse):
             first, after = self.even_part(after, region)
@@ -103,7 +115,7 @@ class CpuRegions:
 
     @ti.func
     def particles_of(self, g: ti.template(), w: int, region: int, count: int):
-        """Return the first particle of a region of run w, and the first after it, of `count` of the g-th group."""
+        """Return the first of `count` particles of the g-th group in a region of run w, and the one after the last."""
         first = w * ti.static(self.device.capacity[g])
         after = first + count
         if ti.static(self.regions > 1):
@@ -115,7 +127,7 @@ class CpuRegions:
 
     @ti.func
     def pencils_of(self, g: ti.template(), region: int):
-        """Return the first pencil of a region for the g-th group, and the first after it."""
+        """Return the first pencil of a region for the g-th group, and the one after the last."""
         first, after = 0, self.device.orders[g].pencils()
         if ti.static(self.regions > 1):
             if region > 0:
@@ -126,13 +138,13 @@ class CpuRegions:
 
     @ti.func
     def divide(self, g: ti.template(), count: int):
-        """Divide the `count` particles of a group, which were sorted, with about as many in each region."""
+        """Divide the `count` sorted particles of a group into regions of about equal numbers of particles."""
         pencils = self.device.orders[g].pencils()
         region = 0
         for r in range(pencils):
             before = self.device.orders[g].first_particle_of(r)
             size = self.device.orders[g].first_particle_of(r + 1) - before
-            # The border falls where more than half of the pencil lies beyond the share.
+            # The border is before the pencil of which more than half is beyond the share.
             while region < self.regions - 1 and before + size // 2 >= share_start(count, region + 1, self.regions):
                 self.pencils[g][region] = r
                 region += 1
@@ -154,7 +166,7 @@ class CpuRegions:
 
     @ti.func
     def divide_rows(self):
-        """Divide the nodes in use as the particles of the first group are."""
+        """Divide the nodes in use like the particles of the first group."""
         d = ti.static(self.dimension)
         rows, least = 1, 0
         for a in ti.static(range(d - 1)):
@@ -169,7 +181,7 @@ class CpuRegions:
                 row += width * ti.min(ti.max(node, 0), extent - 1)
                 width *= extent
                 rest = rest // ti.static(self.device.grid.tiles[a])
-            # Behind the last tile along the first axis.
+            # Beyond the last tile along the first axis.
             if rest > 0:
                 row = rows
             least = ti.max(least, ti.min(row, rows))
@@ -178,17 +190,20 @@ class CpuRegions:
 
 @ti.data_oriented
 class CpuPhases(RunPhases):
-    """The phases of the runs of a batch, w being the number of a run, region and part those of a part.
+    """The phases of the runs of a batch; w is the index of a run, region and part those of a part.
 
-    A step begins with `first_of_step`, a sort with `sorts`, the end of what comes before a frame is `showing`.
+    A step begins with `first_of_step`, a sort with `sorts`, and the preparation of a frame ends with `showing`.
 
     Attributes:
-        shared: whether several threads work on one run; regions: of each run, one for each of them.
-        places: of the regions in the particles and the nodes; shares: parts of a loop over a region.
-        kinds: of the parts.
-        clears: number of the first phase of steps that shift no particles.
+        shared: whether several threads work on one run.
+        regions: number of regions per run, one for each of these threads.
+        places: ranges of particles and nodes of the regions.
+        shares: parts of a loop over a region.
+        kinds: kinds of parts.
+        clears: number of the first phase of steps that do not shift particles.
         last_of_step, sorts, marking, last_of_sort, before_showing, showing: numbers of phases.
-        coloured: (group, first phase) of the phases that go over the pencils of a group, of which there are `passes`.
+        coloured: (group, first phase) of the phases over the pencils of a group.
+        passes: number of consecutive phases over the pencils of a group.
     """
 
     def __init__(self, device: Device, layout: Layout) -> None:
@@ -198,7 +213,7 @@ class CpuPhases(RunPhases):
         self.regions = device.threads if self.shared else 1
         self.places = CpuRegions(device, self.regions)
         self.colours = device.orders[0].colours
-        # What has come in since the sort follows all colours, on one thread.
+        # Particles that entered since the sort follow after all colours, on one thread.
         self.passes = self.colours + device.comes_and_goes
         self.kinds: tuple[PartKind, ...] = ()
         coloured, end = [], 0
@@ -211,21 +226,21 @@ class CpuPhases(RunPhases):
                 coloured.append((phase.group, end - length))
         self.coloured, self.last_of_step, self.sorts = tuple(coloured), end - 1, end
         self.clears = next(kind.first for kind in self.kinds if kind.name == "clear")
-        # Tiles of a sparse grid are numbered before anything is sorted: old numbers are taken, then tiles that hold
-        # particles marked.
+        # Tiles of a sparse grid are numbered before the sort: old numbers are removed, then tiles that contain
+        # particles are marked.
         self.marking = self.sorts + 1
         if device.grid.sparse:
             self._add("forget", 0, self.sorts, 1)
             for g, _ in self.members:
                 end = self._add("mark", g, self.marking, 1)
-        # Of each group: count, place, and for each of its fields keep and take.
+        # Phases of the sort per group: count, place, and two copies (keep and take) per field.
         self.moved = sorted_fields(device.groups)
         self.sorts_of = ()
         for g, fields in enumerate(self.moved):
             self.sorts_of += (end,)
             end = self._add("sort", g, end, 2 + 2 * len(fields))
         self.last_of_sort, self.before_showing = end - 1, end
-        # Before a frame is shown volumes are averaged once more.
+        # Volumes are averaged once more before a frame is shown.
         for g, group in self.members:
             if group.uses_f_bar:
                 end = self._add("average_shown", g, self.before_showing, 1)
@@ -246,11 +261,11 @@ class CpuPhases(RunPhases):
         """Return the method of a kind of parts."""
         return getattr(self, kind.body)
 
-    # A step as a whole, on the thread that leads.
+    # A step as a whole, in the leading thread.
 
     @ti.func
     def begin_launch(self, run: ti.template()):
-        """Store the numbers of a run that its steps need in the precision of particles."""
+        """Store the numbers of a run required by its steps in the precision of particles."""
         (step,) = ti.static((self.step_of(run.w),))
         step.spacing = ti.cast(run.spacing, float)
         step.inverse_spacing = ti.cast(run.inverse_spacing, float)
@@ -260,7 +275,7 @@ class CpuPhases(RunPhases):
 
     @ti.func
     def first_of_step(self, run: ti.template()):
-        """Return the first phase of the step: only where it relaxes volumes are particles shifted before all else."""
+        """Return the first phase of the step; the phases of a shift are skipped unless the step relaxes volumes."""
         phase = 0
         if run.relaxed == 0.0:
             phase += ti.static(self.clears)
@@ -284,7 +299,7 @@ class CpuPhases(RunPhases):
 
     @ti.func
     def share(self, first: int, after: int, part: int):
-        """Return the part of a range."""
+        """Return the first index of a part of a range, and the one after the last."""
         size, shares = after - first, ti.static(self.shares if self.shared else 1)
         return first + share_start(size, part, shares), first + share_start(size, part + 1, shares)
 
@@ -301,10 +316,10 @@ class CpuPhases(RunPhases):
         counts: RunInts,
         frame_buffer: FrameBuffer,
     ):
-        """Do a part of a phase in a region as thread t, if it belongs to the k-th of the `kinds` or to a later one.
+        """Process a part of a phase in a region by thread t, for phases of the k-th of the `kinds` or of a later one.
 
-        A function calls the next one: of several that it calls, Taichi 1.7.4 puts the code into the key of its cache in
-        the order of their addresses, so that the next process would find nothing.
+        Each function calls the next one. If one function called several, Taichi 1.7.4 would order their code in the key
+        of its cache by memory address, so that another process would not find the kernel.
         """
         if phase >= ti.static(self.kinds[k].first) and phase < ti.static(self.kinds[k].after):
             (run,) = ti.static((self.state(w, numbers, counts),))
@@ -315,11 +330,11 @@ class CpuPhases(RunPhases):
         if ti.static(k + 1 < len(self.kinds)):
             self.do(ti.static(k + 1), w, phase, region, part, t, numbers, counts, frame_buffer)
 
-    # Parts of phases that say what they do for each node or particle.
+    # Loops that apply a function to each node or particle.
 
     @ti.func
     def each_node(self, at: ti.template()):
-        """Go through the nodes in use, of all layers."""
+        """Apply the function of a phase to the nodes in use of all layers."""
         if ti.static(at.grid.sparse):
             first, after = self.places.even_part(at.grid.sizes[PENCILS], at.region)
             first, after = self.share(first, after, at.part)
@@ -334,7 +349,7 @@ class CpuPhases(RunPhases):
 
     @ti.func
     def shift_nodes(self, at: ti.template()):
-        """Go through nodes in a shift, where the fine grid says what is in use."""
+        """Apply the function of a phase of a shift to the nodes in use."""
         first, after = self.places.rows_of(at.grid, at.region)
         first, after = self.share(first, after, at.part)
         last_axis = ti.static(self.dimension - 1)
@@ -346,7 +361,7 @@ class CpuPhases(RunPhases):
 
     @ti.func
     def each_in_pencils(self, at: ti.template()):
-        """Go through particles that add to nodes."""
+        """Apply the function of a phase to particles that add to nodes, pencil by pencil."""
         first, after = 0, 0
         if at.turn < self.colours:
             first, after = self.pencils(at.order, at.turn, at.region, at.part)
@@ -361,7 +376,7 @@ class CpuPhases(RunPhases):
 
     @ti.func
     def each_particle(self, at: ti.template()):
-        """Go through particles."""
+        """Apply the function of a phase to particles."""
         first, after = self.places.particles_of(at.g, at.w, at.region, at.run.particles[at.g])
         first, after = self.share(first, after, at.part)
         ti.static(at.item)(at, first, after, at.step.relaxed)
@@ -387,7 +402,7 @@ class CpuPhases(RunPhases):
 
     @ti.func
     def pencils(self, order: ti.template(), colour: int, region: int, part: int):
-        """Return the first pencil of a part of a colour, and the one after the last."""
+        """Return the first pencil of a part of a colour in a region, and the one after the last."""
         first, after = 0, order.pencil_count(colour)
         if ti.static(self.shared):
             first = order.work[colour, region] + part
@@ -396,7 +411,7 @@ class CpuPhases(RunPhases):
 
     @ti.func
     def come_in(self, g: ti.template(), order: ti.template(), run: ti.template()):
-        """Return the first particle that came in since the last sort, and the one after the last."""
+        """Return the first particle that entered since the last sort, and the one after the last."""
         first = order.start[order.first_tile + order.tiles]
         return first, run.w * ti.static(self.device.capacity[g]) + run.particles[g]
 
@@ -417,7 +432,7 @@ class CpuPhases(RunPhases):
         if at.turn < self.colours:
             first, after = self.pencils(at.order, at.turn, at.region, at.part)
             scatter_pencils(at, first, after, kick, relaxed)
-        # On a sparse grid a sort follows on what comes in.
+        # On a sparse grid a sort follows each entry of particles.
         if ti.static(self.device.comes_and_goes and not at.grid.sparse):
             if at.turn == self.colours and at.region == 0 and at.part == 0:
                 first, after = self.come_in(at.g, at.order, at.run)
@@ -425,7 +440,7 @@ class CpuPhases(RunPhases):
 
     @ti.func
     def relax(self, at: ti.template()):
-        """Relax the volumes of particles of the g-th group, in the steps that do."""
+        """Relax the volumes of particles of the g-th group, in steps that relax volumes."""
         relaxed = at.step.relaxed
         if relaxed > 0.0:
             first, after = self.places.particles_of(at.g, at.w, at.region, at.run.particles[at.g])
@@ -437,7 +452,7 @@ class CpuPhases(RunPhases):
 
     @ti.func
     def find_contact(self, at: ti.template()):
-        """Find where walls that let go are pressed."""
+        """Find where material presses on separating walls."""
         self.each_plane_node(at, False)
 
     @ti.func
@@ -447,11 +462,12 @@ class CpuPhases(RunPhases):
 
     @ti.func
     def each_plane_node(self, at: ti.template(), rubs: ti.template()):
-        """Find friction, or else contact, at the nodes in use of the planes of faces."""
+        """Find friction if `rubs`, otherwise contact, at the nodes in use on the planes of faces."""
         gravity_step = self.gravity_of(at.step)
         layers = 1
         if ti.static(rubs):
-            # Where bodies meet walls by their surfaces walls do not find whether they press.
+            # Contact is found only in layer 0: bodies with their own layers are in contact with walls by their
+            # surfaces.
             layers = self.layer_count(at)
         for layer in range(layers):
             own = self.used_by(at, layer)
@@ -467,15 +483,15 @@ class CpuPhases(RunPhases):
 
     @ti.func
     def update(self, at: ti.template()):
-        """Turn the momentum of nodes into velocity."""
+        """Convert the momentum of nodes to velocity."""
         ti.atomic_max(at.step.speed_squared, self.updated(at, False))
 
     @ti.func
     def updated(self, at: ti.template(), meets: ti.template()):
-        """Update nodes, or let them meet rigid bodies; return the square of the largest velocity."""
+        """Update nodes, or if `meets` sum their exchange with rigid bodies; return the largest squared speed."""
         speed_squared = 0.0
         if ti.static(at.grid.sparse):
-            # Whole pencils: what colliders take is added up row by row.
+            # Whole pencils, because the loads on colliders are summed row by row.
             first, after = self.places.even_part(at.grid.sizes[PENCILS], at.region)
             first, after = self.share(first, after, at.part)
             begin, end = at.grid.pencils[first], at.grid.pencils[after]
@@ -491,7 +507,7 @@ class CpuPhases(RunPhases):
 
     @ti.func
     def meet(self, at: ti.template()):
-        """Find the velocities of rigid bodies: add up what nodes would give them, and then solve for it."""
+        """Find the velocities of rigid bodies: sum the contributions of nodes in even turns, and solve in odd turns."""
         if at.turn % 2 == 0:
             self.updated(at, True)
         elif at.region == 0 and at.part == 0:
@@ -499,7 +515,7 @@ class CpuPhases(RunPhases):
 
     @ti.func
     def move_bodies(self, at: ti.template()):
-        """Move rigid bodies, with what the nodes lost to them."""
+        """Move rigid bodies, including the momentum transferred from nodes."""
         if at.region == 0 and at.part == 0:
             for turn in ti.static(range(3)):
                 self.move_rigid(at, turn)
@@ -519,17 +535,17 @@ class CpuPhases(RunPhases):
             rate = advance_range(at.particles, at.g, self.device.groups[at.g], first, after, dt, gravity_step)
             ti.atomic_max(at.step.rate[at.g], rate)
 
-    # Bodies with velocity fields of their own, see `contact.body_contact`.
+    # Bodies with their own velocity fields, see `contact.body_contact`.
 
     @ti.func
     def rows_near_bodies(self, grid: ti.template(), at: ti.template()):
-        """Return the first of a part of the rows of nodes where bodies may meet, and the one after the last."""
+        """Return the first row of a part of the nodes where bodies may be in contact, and the one after the last."""
         first, after = self.places.even_part(grid.row_count(), at.region)
         return self.share(first, after, at.part)
 
     @ti.func
     def find_bodies(self, at: ti.template()):
-        """Find where two bodies meet."""
+        """Find the nodes where bodies are in contact."""
         (grid,) = ti.static(self.near_bodies(at))
         (obstacles,) = ti.static((at.obstacles(),))
         first, after = self.rows_near_bodies(grid, at)
@@ -537,7 +553,7 @@ class CpuPhases(RunPhases):
 
     @ti.func
     def show_surface(self, at: ti.template()):
-        """Find what particles of the g-th group show."""
+        """Find the surface data of particles of the g-th group."""
         (grid,) = ti.static(self.near_bodies(at))
         first, after = self.places.even_part(self.device.contact.surfaces.tile_count(grid, at.w), at.region)
         first, after = self.share(first, after, at.part)
@@ -546,7 +562,7 @@ class CpuPhases(RunPhases):
 
     @ti.func
     def link_surfaces(self, at: ti.template()):
-        """Put what particles show into the bins of their nodes, on one thread, in their order."""
+        """Insert the surface data of particles into the bins of their nodes, in order, on one thread."""
         if at.region == 0 and at.part == 0:
             (grid,) = ti.static(self.near_bodies(at))
             for q in range(self.device.contact.surfaces.tile_count(grid, at.w)):
@@ -555,7 +571,7 @@ class CpuPhases(RunPhases):
 
     @ti.func
     def exchange(self, at: ti.template()):
-        """Let bodies that meet at nodes exchange momentum, and walls and colliders push them."""
+        """Exchange momentum between bodies in contact at nodes, and with walls and colliders."""
         (grid,) = ti.static(self.near_bodies(at))
         (obstacles,) = ti.static((at.obstacles(),))
         gravity_step = self.gravity_of(at.step)
@@ -563,26 +579,26 @@ class CpuPhases(RunPhases):
         thread = at.w * ti.static(self.regions) + at.t
         self.device.contact.exchange_rows(grid, obstacles, at.w, thread, first, after, at.step.dt, gravity_step)
 
-    # Sorts, and frames.
+    # Sorts and frames.
 
     @ti.func
     def forget(self, at: ti.template()):
-        """Take the numbers of the share of a region in the tiles."""
+        """Remove the numbers of the tiles in the share of a region."""
         first, after = self.places.even_part(at.grid.sizes[BLOCKS], at.region)
         at.grid.forget(first, after)
 
     @ti.func
     def mark(self, at: ti.template()):
-        """Mark the tiles of the share of a region in the particles of the g-th group."""
+        """Mark the tiles of the particles of the g-th group in the share of a region."""
         first, after = self.places.even_part(at.run.capacity[at.g], at.region)
         at.grid.mark(at.order, first, after)
 
     @ti.func
     def sort(self, at: ti.template()):
-        """Do the share of a region in a phase of the sort of the g-th group."""
+        """Process the share of a region in a phase of the sort of the g-th group."""
         first = at.w * ti.static(self.device.capacity[at.g])
         begin, end = self.places.even_part(at.run.capacity[at.g], at.region)
-        # Other runs may be at other groups, which begin elsewhere: the scratch memory of a run is that of no other.
+        # Each run has its own scratch memory, because other runs may be sorting other groups, with other offsets.
         own = at.w * ti.static(self.device.orders[at.g].buffers.capacity)
         if at.turn == 0:
             count_tiles(at.order, at.w, at.region, first, begin, end)
@@ -603,10 +619,10 @@ class CpuPhases(RunPhases):
 
     @ti.func
     def show(self, at: ti.template()):
-        """Write what particles of the g-th group show."""
+        """Write the frame data of particles of the g-th group."""
         first, after = self.places.particles_of(at.g, at.w, at.region, at.run.particles[at.g])
         if ti.static(self.device.comes_and_goes):
-            # All of them, those that wait and those that left included.
+            # All particles, including waiting and retired ones.
             first, after = self.places.even_part(at.run.capacity[at.g], at.region)
             first += at.w * ti.static(self.device.capacity[at.g])
             after += at.w * ti.static(self.device.capacity[at.g])

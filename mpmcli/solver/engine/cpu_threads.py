@@ -1,33 +1,36 @@
-"""Threads that share the work of a run of a batch inside one launch.
+"""Threads that share the work of one run inside a launch.
 
-The first thread leads: it publishes a phase, and all threads claim parts of it until none is left. Each begins with
-those of its own region, which its cache holds, and goes on with those of others. A thread that the system has set aside
-delays the others by the part at most that it has claimed.
+The first thread is the leader: it publishes a phase, and all threads claim parts of it until none is left. Each thread
+starts with the parts of its own region, which are in its cache, and continues with those of other regions. A thread
+suspended by the operating system delays the others by at most the part that it has claimed.
 """
 
 from mpmcli.quick_taichi import ti
 from mpmcli.solver.engine.cpu_phases import CpuPhases
 
-# Words that threads share, of 8 bytes: what is published, the number of a phase, its kind and its parts; then, each on
-# a cache line of its own, the parts done, whether the launch is over with the number of threads that work, and of each
-# region the parts claimed, behind the number of the phase.
+# Shared words of 8 bytes: the published phase (its sequence number, the phase, and its number of parts); then, on
+# separate cache lines, the number of finished parts; whether the launch is over, with the number of active threads; and
+# for each region the number of claimed parts, with the sequence number in the upper bits.
 NUMBER, PHASE, PARTS, DONE, OVER, PRESENT, CLAIMED = 0, 1, 2, 8, 16, 17, 24
 LINE = 8
-# Bits of a claim below the number of the phase, which counts up to MOST_NUMBER: more than a phase has parts.
+# Bits of a claim below the sequence number, which counts up to MOST_NUMBER; they exceed the parts of any phase.
 BITS, MASK, MOST_NUMBER = 31, 0x7FFFFFFF, 0x7FFFFFFF
-# Times that a thread looks in vain for a part in its own region before it takes one of another, whose data then move
-# from cache to cache.
+# Number of unsuccessful searches for a part in its own region before a thread takes a part of another region, whose
+# data must move between caches.
 RESPECT = 150
-# Times that a thread looks for a part in vain before it leaves the launch, some milliseconds: the thread that leads has
-# been set aside, and waits for this core perhaps.
+# Number of unsuccessful searches (some milliseconds) before a thread leaves the launch, because the leader may be
+# suspended and waiting for this core.
 LOOKS_IN_VAIN = 200_000
 
 
 @ti.data_oriented
 class CpuThreads:
-    """What threads tell each other.
+    """Communication between the threads of a run.
 
-    phases: what they work on. regions: of a run, one for each thread that shares it.
+    Attributes:
+        phases: phases of the run.
+        regions: number of regions of a run, one per thread.
+        words: shared words of each run.
     """
 
     def __init__(self, phases: CpuPhases, runs: int) -> None:
@@ -37,7 +40,7 @@ class CpuThreads:
 
     @ti.func
     def open(self, w: int):
-        """Begin a launch, before any thread works: nothing is published, so that no part can be claimed."""
+        """Start a launch, before any thread works: no phase is published, so that no part can be claimed."""
         word = w * self.stride
         for region in range(self.regions):
             self.words[word + CLAIMED + LINE * region] = MASK
@@ -48,17 +51,17 @@ class CpuThreads:
 
     @ti.func
     def enter(self, w: int):
-        """Begin to work."""
+        """Register a thread as active."""
         ti.atomic_add(self.words[w * self.stride + PRESENT], 1)
 
     @ti.func
     def leave(self, w: int):
-        """Work no more in this launch: others take all of the region."""
+        """Unregister a thread; others take the parts of its region."""
         ti.atomic_add(self.words[w * self.stride + PRESENT], -1)
 
     @ti.func
     def publish(self, w: int, phase: int):
-        """Let all threads work on a phase; none works on another one."""
+        """Publish a phase to all threads, when no thread works on another phase."""
         word = w * self.stride
         number = (self.words[word + NUMBER] + 1) & MOST_NUMBER
         parts = 0
@@ -68,8 +71,8 @@ class CpuThreads:
         self.words[word + PHASE] = phase
         self.words[word + PARTS] = parts
         self.words[word + DONE] = 0
-        # The claims must be the last to change. Two atomic operations in a row let no write pass on any processor: what
-        # is written before the first one ends before the second one begins (the order of ARM's acquire and release).
+        # The claims must change last. Two consecutive atomic operations are a write barrier on any processor: writes
+        # before the first one are complete before the second one starts (acquire and release order of ARM).
         ti.atomic_add(self.words[word + DONE], 0)
         ti.atomic_add(self.words[word + DONE], 0)
         for region in range(self.regions):
@@ -78,18 +81,18 @@ class CpuThreads:
 
     @ti.func
     def finished(self, w: int):
-        """Return whether every part of the phase that was published is done."""
+        """Return whether all parts of the published phase are finished."""
         word = w * self.stride
         return ti.atomic_add(self.words[word + DONE], 0) >= self.words[word + PARTS]
 
     @ti.func
     def close(self, w: int):
-        """Let the other threads end."""
+        """Let the other threads leave the launch."""
         ti.atomic_max(self.words[w * self.stride + OVER], 1)
 
     @ti.func
     def is_open(self, word: int, region: int, claimed: ti.i64):
-        """Return whether a claim is one of a part that nobody has done, of the phase that is published."""
+        """Return whether a claim refers to an unclaimed part of the published phase."""
         parts = self.phases.parts_of(ti.cast(self.words[word + PHASE], int), region)
         return claimed >> BITS == self.words[word + NUMBER] and (claimed & MASK) < parts
 
@@ -97,10 +100,10 @@ class CpuThreads:
     def help(
         self, w: int, t: int, idle: int, numbers: ti.template(), counts: ti.template(), frame_buffer: ti.template()
     ):
-        """Let thread t do a part of the phase that is published, if one is left.
+        """Process one part of the published phase in thread t, if any is left.
 
-        idle: times in a row that it has found none. Returns 1 where it did, 0 where none was left, and -1 where the
-        launch is over.
+        `idle` is the number of preceding unsuccessful searches. Returns 1 if a part was processed, 0 if none was left,
+        and -1 if the launch is over.
         """
         word = w * self.stride
         found, turn, region, part = 0, 0, 0, 0
@@ -112,7 +115,7 @@ class CpuThreads:
             place = word + CLAIMED + LINE * region
             if self.is_open(word, region, ti.atomic_add(self.words[place], 0)):
                 claimed = ti.atomic_add(self.words[place], 1)
-                # What is published stays as it is as long as a part that was claimed is not done.
+                # The published phase does not change while a claimed part is unfinished.
                 if self.is_open(word, region, claimed):
                     found = 1
                     part = ti.cast(claimed & MASK, int)

@@ -1,4 +1,4 @@
-"""What a batch has on the device, and the view of it that one run has in the kernel."""
+"""The data of a batch on the device, and the view of one run in a kernel."""
 
 from collections.abc import Callable, Sequence
 from copy import copy
@@ -28,21 +28,27 @@ from mpmcli.solver.transfer.splines import PAD
 
 @dataclass(frozen=True)
 class Device:
-    """What a batch has on the device.
+    """The data of a batch on the device.
 
     Attributes:
-        runs: number of runs; capacity: particles of each, per group.
-        groups, orders: of each law, with the particles of all runs.
-        friction, moving: coefficients and velocities of the walls of each run.
-        colliders, motion: those of each run, and how they move; None where there are none.
-        rigid, rigid_contact: those that move freely, and what else than material they meet; None where there are none.
-        values, gravity: numbers that expressions read, and gravity where it varies.
-        emission: the mouths of emitters, None where there are none.
-        contact: of bodies with layers of nodes of their own, None where all share one.
-        stencils: (2 runs, d) int, of each run the first and the last node per axis at which a stencil began when
-            particles were sorted; None on a GPU.
-        sorts: whether particles are sorted; several small runs on a GPU use all nodes of their domains instead.
-        drift_allowed: cells that particles may drift before they are sorted.
+        runs: number of runs.
+        capacity: capacity for particles per run and group.
+        threads: number of CPU threads.
+        grid: the grid.
+        groups, orders: particles and tile order of each law, for all runs.
+        walls: the walls.
+        friction, moving: coefficients of friction and velocities of the walls of each run.
+        nodes, particles: updates of nodes and particles.
+        colliders, motion: colliders of each run, and their motion; None if there are none.
+        rigid, rigid_contact: freely moving rigid bodies, and their contact with other objects than material; None if
+            there are none.
+        values, gravity: numbers for expressions, and varying gravity.
+        emission: mouths of emitters; None if there are none.
+        contact: contact of bodies with their own layers of nodes; None if all share one layer.
+        stencils: (2 runs, d) int, per run the smallest and largest first node of a stencil per axis at the last sort;
+            None on a GPU.
+        sorts: whether particles are sorted; several small runs on a GPU instead use all nodes of their domains.
+        drift_allowed: largest drift of particles before a sort, cells.
     """
 
     runs: int
@@ -70,12 +76,12 @@ class Device:
 
     @property
     def comes_and_goes(self) -> bool:
-        """Whether particles come or go."""
+        """Whether particles enter or leave during a run."""
         return self.groups[0].comes_and_goes
 
     @property
     def phases(self) -> tuple[Phase, ...]:
-        """What a step consists of."""
+        """The phases of a step."""
         return step_phases(
             [group.law for group in self.groups],
             [group.uses_f_bar for group in self.groups],
@@ -98,12 +104,13 @@ def _changed(thing: object, **attributes: object) -> object:
 
 
 class RunView:
-    """What a kernel has of one run: its numbers, and copies of what the device has, with numbers of the run in them.
+    """View of one run in a kernel: its numbers, and copies of the device data with the values of the run.
 
     Attributes:
-        run, step: its numbers, and those of its step; w: its number.
-        grid, nodes, particles: its grid, and the updates of its nodes and particles.
-        orders, groups: of each law.
+        run, step: numbers of the run and of its step.
+        w: index of the run.
+        grid, nodes, particles: grid of the run, and updates of its nodes and particles.
+        orders, groups: tile order and particles of each law.
     """
 
     def __init__(
@@ -118,10 +125,16 @@ class RunView:
         last: object,
         extent: object,
     ) -> None:
-        """Copy; h, inverse, scale: spacing, inverse_spacing and gradient_scale of the `Grid`; box: its box.
+        """Copy the device data.
 
-        These and what follows are variables of the kernel: last: node of the upper walls per axis; extent: of the
-        domain, m.
+        Args:
+            device: the device data.
+            run, step: numbers of the run and of its step.
+            h, inverse, scale: spacing, inverse_spacing and gradient_scale of the `Grid`, variables of the kernel like
+                the following.
+            box: box of the grid.
+            last: node of the upper wall per axis.
+            extent: size of the domain, m.
         """
         w, fixed, fine = run.w, device.grid.fixed, device.grid.fine
         self.run, self.step, self.w = run, step, w
@@ -168,11 +181,15 @@ class RunView:
 
 
 class Work:
-    """What a thread does for a phase, with the view that its run has of the device.
+    """The work of a thread in a phase, with the view of its run.
 
     Attributes:
-        run, step, grid, nodes, particles, order, group: see `RunView`; the last two are those of a group of particles.
-        item: what is done for each node or particle; g: number of the group; w: of the run; turn: of the phase.
+        run, step, grid, nodes, particles: see `RunView`.
+        order, group: tile order and fields of the group of particles.
+        item: function for each node or particle.
+        g: index of the group.
+        w: index of the run.
+        turn: turn of the phase.
     """
 
     def __init__(self, view: RunView, g: int, item: Callable | None, turn: object) -> None:
@@ -182,7 +199,7 @@ class Work:
         self.item, self.turn = item, turn
 
     def in_layer(self, layer: object, own: object) -> "Work":
-        """Return the same for a layer of nodes, by its number and what it has in use, variables of a kernel."""
+        """Return the work for a layer of nodes, given its number and its box in use, variables of a kernel."""
         if self.grid.layers == 1:
             return self
         view = copy(self)
@@ -197,13 +214,13 @@ class Work:
 
 @ti.data_oriented
 class RunPhases:
-    """What the bodies of phases need of the runs of a batch on any device.
+    """Base of the phases of a batch on any device.
 
     Attributes:
-        values: the numbers of the step of each run, see `run_state.STEP`.
-        members: (number, group) of each law.
-        moves, rigid: whether colliders move, as they are told or freely; separates: whether bodies have velocity fields
-            of their own, see `contact.body_contact`.
+        values: numbers of the step of each run, see `run_state.STEP`.
+        members: (index, group) of each law.
+        moves, rigid: whether colliders move as prescribed, and whether any moves freely.
+        separates: whether bodies have their own velocity fields, see `contact.body_contact`.
     """
 
     def __init__(self, device: Device, layout: Layout) -> None:
@@ -222,12 +239,12 @@ class RunPhases:
         return StepState(self.layout, self.values, w)
 
     def step_on_host(self, values: np.ndarray) -> StepState:
-        """Return the numbers of the steps of all runs, in `values`."""
+        """Return the numbers of the steps of all runs, stored in `values`."""
         return StepState(self.layout, values, slice(None))
 
     @ti.func
     def begin_step(self, run: ti.template()):
-        """Store the numbers of a step that was chosen, and put colliders in place."""
+        """Store the numbers of the chosen step, and move colliders to their positions."""
         (step,) = ti.static((self.step_of(run.w),))
         step.dt = ti.cast(run.dt, float)
         step.kick = ti.cast(run.kick, float)
@@ -251,7 +268,7 @@ class RunPhases:
 
     @ti.func
     def find_meetings(self, run: ti.template()):
-        """Find where bodies may meet in a step, with colliders where they are in it."""
+        """Find where bodies may be in contact in a step, with the current positions of colliders."""
         drift = ti.cast(ti.ceil(run.drift), int)
         (view,) = ti.static(self.see(run))
         (obstacles,) = ti.static((Obstacles(view.nodes.images.walls, view.nodes.colliders, view.grid.spacing),))
@@ -259,7 +276,7 @@ class RunPhases:
 
     @ti.func
     def layer_count(self, at: ti.template()):
-        """Return the number of layers: one that compilers do not know, as they would repeat what is done for each."""
+        """Return the number of layers as a run-time value, so that compilers do not unroll loops over layers."""
         count = 1
         if ti.static(self.separates):
             count = self.device.contact.surfaces.count[at.w]
@@ -267,7 +284,7 @@ class RunPhases:
 
     @ti.func
     def used_by(self, at: ti.template(), layer: int):
-        """Return what a layer has in use, as `Grid.box`."""
+        """Return the box in use of a layer, as in `Grid.box`."""
         own = ti.Matrix.zero(int, 2, self.dimension)
         if ti.static(self.separates):
             for i, a in ti.static(ti.ndrange(2, self.dimension)):
@@ -276,7 +293,7 @@ class RunPhases:
 
     @ti.func
     def near_bodies(self, at: ti.template()):
-        """Return the view of the grid in which only nodes where bodies may meet are in use, a tuple."""
+        """Return, in a tuple, the view of the grid restricted to the box in which bodies may be in contact."""
         box = ti.Matrix.zero(int, 2, self.dimension)
         for i, a in ti.static(ti.ndrange(2, self.dimension)):
             box[i, a] = self.device.contact.surfaces.box[at.w * 2 + i, a]
@@ -284,20 +301,20 @@ class RunPhases:
 
     @ti.func
     def forget_extremes(self, step: ti.template()):
-        """Begin to look for the largest speed and rates of a step."""
+        """Reset the largest speed and rates of a step."""
         step.speed_squared = 0.0
         for g in ti.static(range(len(self.members))):
-            # A law may have no particle yet.
+            # A law may not have particles yet.
             step.rate[g] = 0.0 if ti.static(self.device.comes_and_goes) else NOTHING
             step.volume_change[g] = 0.0
 
     @ti.func
     def end_step(self, run: ti.template()):
-        """Store the rates of a step; return the largest speed of a node, m/s, -1 where a particle was lost."""
+        """Store the rates of a step; return the largest speed of a node, m/s, or -1 if a particle was lost."""
         (step,) = ti.static((self.step_of(run.w),))
         speed = ti.sqrt(step.speed_squared)
         for g in ti.static(range(len(self.members))):
-            # What the relaxation adds to the rate of deformation.
+            # The relaxation contributes to the rate of deformation.
             run.rate[g] = ti.cast(step.volume_change[g], ti.f64) / run.dt + ti.cast(step.rate[g], ti.f64)
             if self.device.particles.lost[run.w * ti.static(len(self.members)) + g] != NOT_LOST:
                 speed = -1.0
@@ -305,7 +322,7 @@ class RunPhases:
 
     @ti.func
     def see(self, run: ti.template()):
-        """Return the view of a run, a tuple."""
+        """Return, in a tuple, the view of a run."""
         d = ti.static(self.dimension)
         (step,) = ti.static((self.step_of(run.w),))
         last = ti.Vector.zero(int, d)
@@ -321,7 +338,7 @@ class RunPhases:
 
     @ti.func
     def move_rigid(self, at: ti.template(), turn: ti.template()):
-        """Give rigid bodies what nodes lost to them, in turn 0, resolve their contact, and move them, in turn 2."""
+        """Transfer momentum from nodes to rigid bodies (turn 0), resolve their contact (1), or move them (2)."""
         if ti.static(turn == 0):
             at.nodes.rigid.take(at.w, at.run.dt)
         if ti.static(turn == 1):

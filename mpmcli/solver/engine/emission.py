@@ -1,8 +1,8 @@
-"""How sheets of emitters enter: on the CPU on the thread that leads a run, on a GPU between launches.
+"""Entry of sheets of emitters: on the CPU in the leading thread of a run, on a GPU between launches.
 
-A sheet enters at the first step after it was due; the next one is due a period after it was. Particles whose cell of
-the lattice is occupied when a layer begins stay out. Where these are half of the layer or more, it tries again after a
-share of the time that it takes, and all that follow are due later by as much.
+A sheet enters at the first step after its due time; the next sheet is due one period after this due time. Particles
+whose lattice cell is occupied when a layer begins are blocked permanently. If half of the layer or more is blocked, the
+layer tries again after a fraction of its duration, and all later sheets are delayed accordingly.
 """
 
 import math
@@ -21,23 +21,24 @@ from mpmcli.solver.particles.sort import ACTIVE, BLOCKED, WAITING
 
 @ti.data_oriented
 class CpuEmission:
-    """The sheets of the emitters of the runs of a batch, w being the number of a run.
+    """Entry of sheets for the runs of a batch on the CPU; w is the index of a run.
 
-    needed: whether there are any emitters.
+    Attributes:
+        needed: whether there are any emitters.
     """
 
     def __init__(self, device: Device, stencils: ti.Field) -> None:
-        """Prepare; `stencils` has of each run and axis the first and the last node at which a stencil began."""
+        """Store the device; `stencils` holds, per run and axis, the range of first nodes of stencils."""
         self.stencils, self.separates = stencils, device.contact is not None
         self.device, self.emission = device, device.emission
         self.needed = device.emission is not None
-        # Of each its number, that of its law, and its particles.
+        # Per emitter: its index, the index of its law, and its group of particles.
         self.emitters = tuple((e, g, device.groups[g]) for e, g in (device.emission.members if self.needed else ()))
         self.numbered = tuple(enumerate(device.groups))
 
     @ti.func
     def enter(self, orders: ti.template(), run: ti.template()):
-        """Let all sheets enter that are due and find room."""
+        """Let all due sheets enter whose layers are not blocked."""
         time, due, w = run.time, as_double(math.inf), run.w
         for e, g, group in ti.static(self.emitters):
             going = self.is_left(e, run)
@@ -73,23 +74,23 @@ class CpuEmission:
 
     @ti.func
     def widen(self, order: ti.template(), w: int, p: int):
-        """Let the box of the next steps hold the stencil of particle p."""
+        """Extend the box of the next steps to the stencil of particle p."""
         base = order.first_node_of(p)
         for a in ti.static(range(self.device.grid.dimension)):
             self.stencils[w * 2, a] = ti.min(self.stencils[w * 2, a], base[a])
             self.stencils[w * 2 + 1, a] = ti.max(self.stencils[w * 2 + 1, a], base[a])
         if ti.static(self.separates):
-            # What comes in is in layer 0.
+            # Emitted particles are in layer 0.
             self.device.contact.surfaces.widen(w * ti.static(self.device.grid.layers), base)
 
     @ti.func
     def is_left(self, e: ti.template(), run: ti.template()):
-        """Return whether another sheet enters, at whatever time."""
+        """Return whether any sheet of an emitter is still to enter."""
         return run.due_of[e] < run.until[e] and run.entered[e] < run.sheets[e]
 
     @ti.func
     def look(self, e: ti.template(), run: ti.template(), sheet: int, late: float):
-        """Find which cells of the layer that begins with a sheet, which was due `late` s ago, hold a particle."""
+        """Mark the cells occupied by particles for the layer that begins with `sheet`, which was due `late` s ago."""
         self.emission.clear(e, run.w)
         for g, group in ti.static(self.numbered):
             first = run.w * ti.static(self.device.capacity[g])
@@ -98,7 +99,7 @@ class CpuEmission:
 
     @ti.func
     def count_active(self, run: ti.template()):
-        """Count the particles that take part after a sort."""
+        """Count the active particles after a sort."""
         if ti.static(self.device.comes_and_goes):
             for g in ti.static(range(len(self.numbered))):
                 after = run.w * ti.static(self.device.orders[g].bins + 1) + ti.static(self.device.orders[g].tiles)
@@ -107,12 +108,15 @@ class CpuEmission:
 
 @ti.data_oriented
 class GpuEmission:
-    """The sheets of the emitters of the runs of a batch on a GPU; a sort follows each of them.
+    """Entry of sheets for the runs of a batch on a GPU; a sort follows each entry.
 
     Attributes:
-        counts: (runs, counts) int, those of `Batch` on the device.
-        enters: (runs) int, whether the next sheet of an emitter enters; sheet: its number; late: s since it was due.
-        blocked: (runs) int, particles of its layer that find no room; layer: particles of that.
+        counts: (runs, counts) int, `Batch.counts` on the device.
+        enters: (runs) int, whether the next sheet of an emitter enters.
+        sheet: (runs) int, index of this sheet.
+        late: (runs) time since it was due, s.
+        blocked: (runs) int, number of blocked particles of its layer.
+        layer: (runs) int, number of particles of this layer.
     """
 
     def __init__(self, device: Device, layout: Layout, counts: ti.Field) -> None:
@@ -123,7 +127,7 @@ class GpuEmission:
         self.late = ti.field(float, shape=self.runs)
 
     def enter(self, runs: RunState, going: np.ndarray) -> None:
-        """Let the sheets enter that are due in those of all runs that go on."""
+        """Let all due sheets enter in the advancing runs."""
         due = going & (runs.due <= runs.time)
         while due.any():
             for e, _ in self.emission.members:
@@ -134,11 +138,11 @@ class GpuEmission:
             due &= runs.due <= runs.time
 
     def _is_left(self, e: int, runs: RunState) -> np.ndarray:
-        """Return whether another sheet of an emitter enters, at whatever time."""
+        """Return whether any sheet of an emitter is still to enter."""
         return (runs.due_of[e] < runs.until[e]) & (runs.entered[e] < runs.sheets[e])
 
     def _enter_one(self, e: int, runs: RunState, due: np.ndarray) -> None:
-        """Let one sheet of an emitter enter in each of these runs where it is due and finds room."""
+        """Let one sheet of an emitter enter in each of these runs in which it is due and its layer is not blocked."""
         asked = due & (runs.due_of[e] <= runs.time) & self._is_left(e, runs)
         if not asked.any():
             return
@@ -165,7 +169,7 @@ class GpuEmission:
 
     @ti.kernel
     def find_blocked(self, e: ti.template()):
-        """Find how many particles of the layer that an emitter begins find no room, and how many it has."""
+        """Count the blocked particles and all particles of the layer that an emitter begins."""
         source = ti.static(self.emission.members[e][1])
         for w in range(self.runs):
             self.emission.clear(e, w)
@@ -186,17 +190,17 @@ class GpuEmission:
 
     @ti.func
     def looks(self, e: ti.template(), w: int):
-        """Return whether the next sheet of an emitter may enter, and begins a layer."""
+        """Return whether the next sheet of an emitter may enter and begins a layer."""
         return self.enters[w] == 1 and self.sheet[w] % self.emission.ids[w, e][2] == 0
 
     @ti.func
     def is_one(self, g: ti.template(), w: int, p: int):
-        """Return whether a run has a particle at place p of a group."""
+        """Return whether entry p of a group is a particle of its run."""
         return p - w * self.capacity[g] < self.counts[w, ti.static(self.layout.counts["capacity"][g])]
 
     @ti.kernel
     def let_enter(self, e: ti.template()):
-        """Let what has room of the next sheet of an emitter take part, and keep out what has none of its layer."""
+        """Activate the unblocked particles of the next sheet of an emitter; block the others of its layer."""
         g = ti.static(self.emission.members[e][1])
         (group,) = ti.static((self.device.groups[g],))
         for p in range(self.runs * self.capacity[g]):
@@ -209,9 +213,13 @@ class GpuEmission:
 
 
 def begin_emission(batch: object, slot: int, scene: Scene, particles: Sequence[int]) -> None:
-    """Store the mouths of the emitters of a run, and when their sheets enter.
+    """Store the mouths of the emitters of a run and the times of their sheets.
 
-    batch: the `Batch`; slot: place of the run in it; particles: number of them, of each source.
+    Args:
+        batch: the `Batch`.
+        slot: slot of the run in the batch.
+        scene: the scene of the run.
+        particles: number of particles of each source.
     """
     run = batch.state(slot)
     run.slowest = max((highest_speed(emitter) for emitter in scene.emitters), default=0.0)
@@ -219,7 +227,7 @@ def begin_emission(batch: object, slot: int, scene: Scene, particles: Sequence[i
         return
     found = batch.device.emission.write(scene, first_ids(scene, particles), slot)
     for e, (sheets, emitter) in enumerate(zip(found, scene.emitters, strict=True)):
-        # A sheet enters at the first step after it was due; none is due from `until` on.
+        # A sheet enters at the first step after its due time; no sheet is due from `until` on.
         run.due_of[e], run.period[e], run.sheets[e] = sheets.start, sheets.period, sheets.count
         run.until[e] = min(scene.time.end, math.inf if emitter.end is None else emitter.end)
         if sheets.count and sheets.start < run.until[e]:

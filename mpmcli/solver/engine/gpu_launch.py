@@ -1,10 +1,11 @@
-"""Carries out steps on a GPU: a launch takes several steps of all runs, with a thread for each particle or node.
+"""Carries out steps on a GPU: a launch takes several steps of all runs, with a thread per particle or node.
 
-Each run takes steps of its own size, and rests where the host has to attend to it: to sort its particles, to let sheets
-of emitters enter, or for what its status says. Where the device has no double precision, the host counts the time and
+Each run takes steps of its own size, and pauses when it needs the host: to sort its particles, to let sheets of
+emitters enter, or as its status requires. On a device without double precision the host accumulates the time and
 chooses the steps, with the same functions (`step_size.StepSize`), and a launch takes one step.
 
-Scatters add atomically: in any order, so that bytes differ from run to run, or in fixed point (`fixed_point`).
+Scatters use atomic additions: in floating point, in arbitrary order, so that results differ in rounding from run to
+run, or in fixed point (`fixed_point`), which is reproducible.
 """
 
 from collections.abc import Callable
@@ -35,21 +36,26 @@ from mpmcli.stability.transfer_factors import INTERVAL
 
 
 class Item(Work):
-    """A node, a particle, or a row of nodes, number q, that a thread works on; atomic: whether sums need that, True."""
+    """The item q of a thread: a node, a particle or a row of nodes.
+
+    Attributes:
+        atomic: whether sums need atomics; True.
+    """
 
     atomic = True
 
     def __init__(self, view: RunView, phase: Phase, turn: int, q: object) -> None:
-        """Keep a view, and a variable of a kernel."""
+        """Store a view and a variable of a kernel."""
         super().__init__(view, phase.group, phase.body, turn)
         self.q = q
 
 
 @ti.data_oriented
 class GpuPhases(RunPhases):
-    """The phases of the runs of a batch, w being the number of a run and q that of a node, a particle, or a row.
+    """The phases of the runs of a batch; w is the index of a run and q that of a node, a particle or a row.
 
-    numbers, counts: those of `Batch` on the device; the numbers are None where it has no double precision.
+    Attributes:
+        numbers, counts: the arrays of `Batch` on the device; `numbers` is None without double precision.
     """
 
     def __init__(self, device: Device, layout: Layout, *, doubles: bool) -> None:
@@ -63,7 +69,7 @@ class GpuPhases(RunPhases):
 
     @ti.func
     def do(self, phase: ti.template(), turn: ti.template(), w: int, q: int):
-        """Do what a phase does for one item of a run in one of its turns."""
+        """Process one item of a run in one turn of a phase."""
         (run,) = ti.static((self.run(w),))
         (view,) = ti.static(self.see(run))
         (at,) = ti.static((Item(view, phase, turn, q),))
@@ -79,7 +85,7 @@ class GpuPhases(RunPhases):
 
     @ti.func
     def in_layers(self, at: ti.template(), node: ti.template(), do: ti.template()):
-        """Do something at a node, for each layer that has it in use."""
+        """Call `do` at a node for each layer in which the node is in use."""
         if ti.static(at.grid.layers == 1):
             ti.static(do)(at, node)
         else:
@@ -94,30 +100,30 @@ class GpuPhases(RunPhases):
 
     @ti.func
     def each_node(self, at: ti.template()):
-        """Do what the phase says for a node."""
+        """Apply the function of a phase to a node of all layers."""
         if at.q < at.grid.box_nodes():
             self.in_layers(at, at.grid.box_node(at.q), self.do_item)
 
     @ti.func
     def do_item(self, at: ti.template(), node: ti.template()):
-        """Do what the phase says for a node of a layer."""
+        """Apply the function of a phase to a node of a layer."""
         ti.static(at.item)(at, node, at.step.kick)
 
     @ti.func
     def shift_node(self, at: ti.template()):
-        """Do what the phase says for a node, in the steps that shift particles."""
+        """Apply the function of a phase to a node in steps that shift particles."""
         if at.step.relaxed > 0.0 and at.q < at.grid.box_nodes():
             ti.static(at.item)(at, at.grid.box_node(at.q), at.step.relaxed)
 
     @ti.func
     def shift_particle(self, at: ti.template()):
-        """Do what the phase says for a particle, in the steps that shift particles."""
+        """Apply the function of a phase to a particle in steps that shift particles."""
         if at.step.relaxed > 0.0:
             ti.static(at.item)(at, at.q, at.step.relaxed)
 
     @ti.func
     def clear(self, at: ti.template()):
-        """Clear a node."""
+        """Clear a node of all layers."""
         if at.q < at.grid.box_nodes():
             node = at.grid.box_node(at.q)
             self.in_layers(at, node, self.clear_node)
@@ -132,7 +138,7 @@ class GpuPhases(RunPhases):
 
     @ti.func
     def average(self, at: ti.template()):
-        """Add a particle to the averages of its cell."""
+        """Add a particle to the sums of its cell."""
         add_volume(at.grid, at.g, at.group, at.q)
 
     @ti.func
@@ -143,18 +149,18 @@ class GpuPhases(RunPhases):
         particles.scatter(at.g, at.group, at.q, at.step.kick, at.step.relaxed)
 
     def beside(self, at: Item, layer: object) -> ParticleUpdate:
-        """Return the update of particles whose nodes are those of a layer, a variable of a kernel."""
+        """Return the particle update with the nodes of a layer, which is a variable of a kernel."""
         return at.particles if at.grid.layers == 1 else at.particles.beside(at.grid.in_layer(layer, None))
 
     @ti.func
     def to_float(self, at: ti.template()):
-        """Set a node from its sums in fixed point."""
+        """Convert the sums of a node from fixed point."""
         if at.q < at.grid.box_nodes():
             at.grid.fixed.to_float(at.grid, at.grid.linear_index(at.grid.box_node(at.q)), at.step.relaxed)
 
     @ti.func
     def relax(self, at: ti.template()):
-        """Relax the volume of a particle, in the steps that do."""
+        """Relax the volume of a particle in steps that relax volumes."""
         if at.step.relaxed > 0.0:
             change = at.particles.relax(self.device.groups[at.g], at.q, at.step.relaxed)
             if change > at.step.volume_change[at.g]:
@@ -162,13 +168,13 @@ class GpuPhases(RunPhases):
 
     @ti.func
     def find_contact(self, at: ti.template()):
-        """Find whether a wall that lets go is pressed."""
+        """Find whether material presses on a separating wall at a node."""
         if at.q < at.nodes.images.plane_nodes(at.grid):
             at.nodes.images.find_contact(at.grid, at.q, self.gravity_of(at.step))
 
     @ti.func
     def find_friction(self, at: ti.template()):
-        """Find the friction of a wall."""
+        """Find the friction of a wall at a node, for all layers."""
         for layer in range(self.layer_count(at)):
             own = self.used_by(at, layer)
             (inner,) = ti.static((at.in_layer(layer, own),))
@@ -178,21 +184,21 @@ class GpuPhases(RunPhases):
 
     @ti.func
     def update(self, at: ti.template()):
-        """Turn the momentum of a node into velocity."""
+        """Convert the momentum of a node to velocity in all layers."""
         if at.q < at.grid.box_nodes():
             self.in_layers(at, at.grid.box_node(at.q), self.update_node)
 
     @ti.func
     def update_node(self, at: ti.template(), node: ti.template()):
-        """Turn the momentum of a node of a layer into velocity."""
+        """Convert the momentum of a node of a layer to velocity."""
         squared = at.nodes.update(node, at.grid.linear_index(node), self.gravity_of(at.step))
-        # The comparison may be late, and saves most atomics.
+        # The comparison may use an old value; it avoids most atomic operations.
         if squared > at.step.speed_squared:
             ti.atomic_max(at.step.speed_squared, squared)
 
     @ti.func
     def meet(self, at: ti.template()):
-        """Find the velocities of rigid bodies: add up what nodes would give them, and then solve for it."""
+        """Find the velocities of rigid bodies: sum the contributions of nodes in even turns, and solve in odd turns."""
         if ti.static(at.turn % 2 == 0):
             if at.q < at.grid.row_count():
                 _speed = update_rows(at, at.q, at.q + 1, self.gravity_of(at.step), True)
@@ -206,7 +212,7 @@ class GpuPhases(RunPhases):
 
     @ti.func
     def add_loads(self, at: ti.template()):
-        """Add up what the nodes of a row gave to a collider, in their order."""
+        """Sum the loads of the nodes of a row on a collider, in order."""
         at.nodes.colliders.add_row(at.q)
 
     @ti.func
@@ -218,11 +224,11 @@ class GpuPhases(RunPhases):
         if rate > at.step.rate[at.g]:
             ti.atomic_max(at.step.rate[at.g], rate)
 
-    # Bodies with velocity fields of their own, see `contact.body_contact`.
+    # Bodies with their own velocity fields, see `contact.body_contact`.
 
     @ti.func
     def find_bodies(self, at: ti.template()):
-        """Find which bodies are at a node, and whether they meet anything."""
+        """Find which bodies are at a node, and whether they are in contact."""
         (grid,) = ti.static(self.near_bodies(at))
         (obstacles,) = ti.static((at.obstacles(),))
         if at.q < grid.box_nodes():
@@ -230,29 +236,29 @@ class GpuPhases(RunPhases):
 
     @ti.func
     def show_surface(self, at: ti.template()):
-        """Find what a particle shows."""
+        """Find the surface data of a particle."""
         (grid,) = ti.static(self.near_bodies(at))
         self.device.contact.surfaces.count_particle(at.g, grid, at.w, at.q)
 
     @ti.func
     def reserve(self, at: ti.template()):
-        """Reserve places for what is shown at a node."""
+        """Reserve space for the surface data at a node."""
         self.at_bins(at, self.device.contact.surfaces.reserve)
 
     @ti.func
     def put(self, at: ti.template()):
-        """Put a particle into its place."""
+        """Store a particle in its reserved space."""
         (grid,) = ti.static(self.near_bodies(at))
         self.device.contact.surfaces.put(at.g, grid, at.w, at.q)
 
     @ti.func
     def chain(self, at: ti.template()):
-        """Make lists of what is shown at a node."""
+        """Make lists of the surface data at a node."""
         self.at_bins(at, self.device.contact.surfaces.chain)
 
     @ti.func
     def at_bins(self, at: ti.template(), do: ti.template()):
-        """Do something with the bins of a node where bodies may meet."""
+        """Call `do` for the bins of a node where bodies may be in contact."""
         (grid,) = ti.static(self.near_bodies(at))
         if at.q < grid.box_nodes():
             place = self.device.contact.surfaces.place_of(grid, at.w, grid.linear_index(grid.box_node(at.q)))
@@ -260,7 +266,7 @@ class GpuPhases(RunPhases):
 
     @ti.func
     def exchange(self, at: ti.template()):
-        """Let bodies exchange momentum at some nodes, and walls and colliders push them."""
+        """Exchange momentum between bodies at some nodes, and with walls and colliders."""
         (grid,) = ti.static(self.near_bodies(at))
         obstacles, threads = ti.static((at.obstacles(), self.device.contact.threads))
         gravity_step, q = self.gravity_of(at.step), at.q
@@ -270,11 +276,11 @@ class GpuPhases(RunPhases):
             self.device.contact.exchange_all(grid, obstacles, at.w, thread, node, index, at.step.dt, gravity_step)
             q += threads
 
-    # What is done beside the steps.
+    # Work outside of steps.
 
     @ti.func
     def average_for_frame(self, g: ti.template(), w: int, p: int, turn: ti.template()):
-        """Average volumes before a frame is read: clear the cell of a particle, add it, and take the mean."""
+        """Average volumes before a frame: clear the cell of a particle (turn 0), add it (1), or take the mean (2)."""
         (run,) = ti.static((self.run(w),))
         (view,) = ti.static(self.see(run))
         if ti.static(turn == 0):
@@ -286,7 +292,7 @@ class GpuPhases(RunPhases):
 
     @ti.func
     def bin_of(self, g: ti.template(), w: int, p: int):
-        """Put a particle back into the domain where that repeats, and return its bin."""
+        """Wrap a particle into a periodic domain and return its bin."""
         (run,) = ti.static((self.run(w),))
         (view,) = ti.static(self.see(run))
         view.orders[g].wrap(p)
@@ -306,7 +312,7 @@ class GpuPhases(RunPhases):
 
     @ti.func
     def nodes_in_use(self, w: int):
-        """Return the number of nodes in use, of those on the planes of faces, and of rows."""
+        """Return the numbers of nodes in use, of nodes in use on the planes of faces, and of rows."""
         (run,) = ti.static((self.run(w),))
         (view,) = ti.static(self.see(run))
         planes = 0
@@ -315,14 +321,15 @@ class GpuPhases(RunPhases):
         return view.grid.box_nodes(), planes, view.grid.row_count()
 
 
-# Most steps of a launch, after which the host attends to the runs that need it.
+# Largest number of steps of a launch, after which the host handles the runs that need it.
 STEPS = 32
-# Launches of a step: what shifts particles, in few steps; all phases, or those until bodies meet nodes; a round of
-# that. Each turn of a phase after it is a launch, as drivers may take minutes to compile those of bodies beside others.
+# Launches of a step: the shift of particles, in few steps; all other phases, or with rigid bodies those before "meet";
+# one round of "meet". Each turn of a later phase is a launch of its own, because drivers may take minutes to compile
+# phases of rigid bodies together with others.
 SHIFT, FIRST, ROUND = range(3)
-# Turns on a GPU of a round, and of the phase that moves bodies.
+# Turns on a GPU of a round of "meet", and of the phase that moves bodies.
 TURNS = {"meet": 2, "move_bodies": 3}
-# What phases run over beside particles, see `Phase`.
+# Items of phases other than particles, see `Phase`.
 OVER = ("nodes", "planes", "rows", "loads", "bodies", "threads")
 
 
@@ -331,10 +338,12 @@ class GpuLaunch:
     """The kernels of a batch on a GPU.
 
     Attributes:
-        phases: their bodies, and the numbers of runs that these read; steps: how a step is chosen.
-        parts: the phases of each launch of a step, with their turns.
-        doubles: whether the device has double precision; shifts: whether some steps shift particles.
-        reach: the largest number of items of a run of each kind, see OVER.
+        phases: bodies of the phases, and the numbers of runs that they read.
+        steps: choice of steps.
+        parts: phases of each launch of a step, with their turns.
+        doubles: whether the device has double precision.
+        shifts: whether some steps shift particles.
+        reach: largest number of items per run of each kind, see OVER.
     """
 
     def __init__(self, device: Device, layout: Layout, *, doubles: bool) -> None:
@@ -361,7 +370,7 @@ class GpuLaunch:
     # A launch.
 
     def __call__(self, numbers: np.ndarray, counts: np.ndarray) -> None:
-        """Advance all runs; `numbers` and `counts` as of `Batch`."""
+        """Advance all runs; `numbers` and `counts` are those of `Batch`."""
         runs = self.phases.state(slice(None), numbers, counts)
         going = (runs.status == GOING) & (runs.budget > 0)
         self.phases.values.from_numpy(self._domains(runs))
@@ -376,7 +385,7 @@ class GpuLaunch:
         self._measure(runs)
 
     def _domains(self, runs: RunState) -> np.ndarray:
-        """Return the numbers of steps, see STEP, with those of the domains in them."""
+        """Return the numbers of steps (see STEP) with the values of the domains set."""
         values = np.zeros((self.runs, self.layout.widths["step"]), self.device.groups[0].real)
         steps = self.phases.step_on_host(values)
         steps.spacing, steps.inverse_spacing = runs.spacing, runs.inverse_spacing
@@ -384,7 +393,7 @@ class GpuLaunch:
         return values
 
     def _take_steps(self, runs: RunState, numbers: np.ndarray, counts: np.ndarray, going: np.ndarray) -> None:
-        """Take steps that the device chooses, until a run has to be sorted."""
+        """Take steps chosen by the device until a run must be sorted."""
         self.numbers.from_numpy(numbers)
         room = self.device.drift_allowed - runs.drift[going]
         steps = np.min(room / np.maximum(runs.courant[going], 1e-3), initial=STEPS)
@@ -394,7 +403,7 @@ class GpuLaunch:
         numbers[:], counts[:] = self.numbers.to_numpy(), self.counts.to_numpy()
 
     def _take_host_step(self, runs: RunState, numbers: np.ndarray, counts: np.ndarray, going: np.ndarray) -> None:
-        """Take a step that the host chooses."""
+        """Take a step chosen by the host."""
         stepping, values = np.zeros(self.runs, np.int32), self._domains(runs)
         steps = self.phases.step_on_host(values)
         for w in np.flatnonzero(going).tolist():
@@ -414,7 +423,7 @@ class GpuLaunch:
             self.steps.end(run, float(np.sqrt(steps.speed_squared[w])) if sound else -1.0)
 
     def _take_step(self, *, shifts: bool) -> None:
-        """Take a step of every run that goes on, part by part; few steps shift particles before all else."""
+        """Take a step of every advancing run, launch by launch; few steps shift particles first."""
         if shifts:
             self.step(SHIFT)
         self.step(FIRST)
@@ -441,7 +450,7 @@ class GpuLaunch:
 
     @ti.kernel
     def step(self, part: ti.template()):
-        """Carry out a launch of a step of every run that goes on; the first one begins it, and the last one ends it."""
+        """Carry out one launch of a step of all advancing runs; the first begins the step, the last ends it."""
         if ti.static(part in (SHIFT, FIRST)):
             for w in range(self.runs):
                 if ti.static(self.doubles):
@@ -468,13 +477,13 @@ class GpuLaunch:
 
     @ti.func
     def takes_part(self, g: ti.template(), w: int, p: int):
-        """Return whether a particle of run w takes part; those that do come first."""
+        """Return whether particle p of run w is active; active particles precede all others."""
         (run,) = ti.static((self.phases.run(w),))
         return p - w * ti.static(self.capacity[g]) < run.particles[g]
 
     @ti.func
     def begin(self, w: int):
-        """Choose the step of a run that goes on."""
+        """Choose the step of an advancing run."""
         self.stepping[w] = 0
         (run,) = ti.static((self.phases.run(w),))
         rests = run.drift >= as_double(self.device.drift_allowed) or run.due <= run.time
@@ -485,7 +494,7 @@ class GpuLaunch:
 
     @ti.func
     def prepare(self, w: int):
-        """Begin the step of a run that was chosen, by the host where the device has no double precision."""
+        """Begin the chosen step of a run, which the host chooses without double precision."""
         (step,) = ti.static((self.phases.step_of(w),))
         if self.stepping[w] == 1:
             if ti.static(self.device.values.gravity_varies and not self.doubles):
@@ -498,14 +507,14 @@ class GpuLaunch:
 
     @ti.func
     def end(self, w: int):
-        """Count the step of a run."""
+        """Finish the step of a run."""
         (run,) = ti.static((self.phases.run(w),))
         self.steps.end(run, self.phases.end_step(run))
 
     # Measurements of the state.
 
     def _measure(self, runs: RunState) -> None:
-        """Store the maxima of each group of the runs that wait for them."""
+        """Store the maxima of each group of the runs that require a measurement."""
         waiting = np.isin(runs.status, (MEASURE, ATTEND))
         if not waiting.any():
             return
@@ -537,7 +546,7 @@ class GpuLaunch:
     # Sorts.
 
     def _sort_where_due(self, runs: RunState, counts: np.ndarray, going: np.ndarray) -> None:
-        """Sort the particles of runs in which they have drifted, and find the nodes in use."""
+        """Sort the particles of runs with too much drift, and find the nodes in use."""
         due = going & (runs.drift >= self.device.drift_allowed)
         if not due.any():
             return
@@ -616,13 +625,13 @@ class GpuLaunch:
 
     @ti.func
     def is_sorted(self, g: ti.template(), w: int, p: int):
-        """Return whether a particle is of a run that is marked."""
+        """Return whether a particle belongs to a marked run."""
         (run,) = ti.static((self.phases.run(w),))
         return self.sorting[w] == 1 and p - w * ti.static(self.capacity[g]) < run.capacity[g]
 
     @ti.kernel
     def find_box(self):
-        """Find the nodes that runs use until their next sort; all of them where particles are not sorted."""
+        """Find the nodes that runs use until their next sort; all nodes if particles are not sorted."""
         for w, a in ti.ndrange(self.runs, self.dimension):
             self.stencils[2 * w, a], self.stencils[2 * w + 1, a] = 2**30, -1
         if ti.static(self.phases.separates):
@@ -638,7 +647,7 @@ class GpuLaunch:
                         if ti.static(self.phases.separates):
                             self.device.contact.surfaces.widen(self.phases.layer_of(g, w, p), base)
                         for a in ti.static(range(self.dimension)):
-                            # The comparisons may be late, and save most atomics.
+                            # The comparisons may use old values; they avoid most atomic operations.
                             if base[a] < self.stencils[2 * w, a]:
                                 ti.atomic_min(self.stencils[2 * w, a], base[a])
                             if base[a] > self.stencils[2 * w + 1, a]:
@@ -652,7 +661,7 @@ class GpuLaunch:
                     if ti.static(self.sorts):
                         low, high = self.stencils[2 * w, a], self.stencils[2 * w + 1, a]
                         if high < 0:
-                            # Where none takes part there is a box all the same.
+                            # Without active particles the box must still be valid.
                             low, high = PAD, PAD
                         drift = ti.static(self.device.grid.tile)
                         first, last = box_of(self.device.grid, a, low, high, drift, last_wall)
@@ -688,7 +697,7 @@ class GpuLaunch:
                             self.phases.average_for_frame(g, w, p, turn)
 
     def _reader(self, g: int) -> Callable[..., None]:
-        """Return the kernel that writes what particles of a group show."""
+        """Return the kernel that writes the frame data of particles of a group."""
         group = self.device.groups[g]
 
         @ti.kernel
@@ -713,5 +722,5 @@ class GpuLaunch:
     def read(
         self, g: int, run: int, first: int, count: int, dt: float, columns: FrameColumns, frame_buffer: np.ndarray
     ) -> None:
-        """Write what particles of the g-th group of a run show into the rows of their numbers, (n, columns)."""
+        """Write the frame data of particles of the g-th group of a run to the rows of their ids, (n, columns)."""
         self.readers[g](run, first, count, dt, *chosen_columns(columns), frame_buffer)

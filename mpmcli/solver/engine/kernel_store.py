@@ -1,10 +1,10 @@
-"""Finds the compiled kernel of a batch without Taichi's front end, which is a third of a warm start and more.
+"""Loads the compiled kernel of a batch without Taichi's front end, which takes at least a third of a warm start.
 
-Taichi keeps compiled kernels in files, by a key of their intermediate form, which its front end has to make first. The
-store has a key of all that a kernel is made from. A stub, a kernel of a few lines that Taichi finds in a millisecond,
-holds that key in its source; the file that Taichi keeps for the stub is replaced, once both have been written, by that
-of the kernel, and from then on the stub is the kernel. Taichi compares the checksum of a file: where it is damaged or
-gone, the stub is compiled as what it is, and leaves a mark; then the kernel itself is launched.
+Taichi caches compiled kernels in files, by a key of their intermediate representation, which its front end must
+generate first. The store uses a key of all inputs of a kernel instead. A stub, a kernel of a few lines that Taichi
+finds in a millisecond, contains this key in its source. After Taichi has written the files of both, the file of the
+stub is replaced by that of the kernel, so that launching the stub runs the kernel. Taichi verifies the checksum of a
+file. If the file is damaged or missing, the stub itself is compiled and leaves a mark; then the kernel is launched.
 """
 
 import contextlib
@@ -28,30 +28,32 @@ from mpmcli.solver.engine.cpu_launch import CpuLaunch, FrameStats
 from mpmcli.solver.engine.cpu_phases import FrameBuffer, RunInts, RunReals
 from mpmcli.solver.machine.backend import Backend, after_stop
 
-# Versions of Taichi whose files test_kernel_store.py has been run with.
+# Versions of Taichi with which test_kernel_store.py has passed.
 KNOWN_VERSIONS = ((1, 7, 4),)
 PACKAGE = Path(__file__).resolve().parents[2]
-# A file of Taichi: magic, architecture, lengths of what follows; description, code; SHA-256 of both in hexadecimal.
+# Layout of a Taichi file: magic, architecture, lengths of description and code; description, code; SHA-256 of both in
+# hexadecimal.
 HEAD = struct.Struct("<4sIQQ")
 DIGEST = 64
-# Parts of the package that kernels are made from: what they import is among them, or a module beside them.
+# Subpackages from which kernels are generated; their imports are among them, or modules of the package itself.
 SOURCES = ("scene", "frames", "stability", "materials", "boundaries", "solver")
-# What no kernel depends on: docstrings, which begin a line, and lines of comments.
+# Text that does not affect kernels: docstrings, which start a line, and comment lines.
 PROSE = re.compile(rb'^ *""".*?"""\n|^ *#[^\n]*\n', re.MULTILINE | re.DOTALL)
-# Clocks of a file system and of this machine differ by less, s.
+# Upper bound of the difference between the clocks of a file system and of this machine, s.
 CLOCKS = 2.0
-# What the stub leaves in frame_stats[0, 0, 0], which is never negative otherwise.
+# Value that the stub stores in frame_stats[0, 0, 0], which is otherwise never negative.
 MARK = -(2**30)
-# Where this variable is "off", kernels are neither stored nor found: for who changes modules while they run.
+# Environment variable; "off" disables the store, for work on modules while they run.
 SWITCH = "MPMCLI_KERNEL_STORE"
-# Keys of kernels that this process has compiled, the folder of Taichi's files, and when compilation began, s.
+# Keys of kernels compiled by this process, with the folder of Taichi's files and the start time of the compilation, s.
 _compiled: dict[str, tuple[Path, float]] = {}
 
 
 class StoredLaunch:
-    """Launches the kernel of a batch on the CPU: the stored one, or the one of `CpuLaunch`.
+    """Launches the kernel of a batch on the CPU: the stored kernel, or that of `CpuLaunch`.
 
-    stored: whether the last launch was that of a stored kernel.
+    Attributes:
+        stored: whether the kernel was loaded from the store.
     """
 
     def __init__(self, launch: CpuLaunch, kind: CompiledKind, backend: Backend) -> None:
@@ -87,7 +89,7 @@ class StoredLaunch:
         self._kernel = self._launch.launch
 
     def _may_store(self) -> bool:
-        """Return whether all that the kernel is made from is known: laws of plugins may import anything."""
+        """Return whether all inputs of the kernel are known; laws of plugins may import anything."""
         own = all(type(law).__module__.startswith("mpmcli.") for law in self._kind.members)
         known = own and ti.__version__ in KNOWN_VERSIONS and _unchanged_since(psutil.Process().create_time())
         return known and self._backend.compile_cache and os.environ.get(SWITCH) != "off"
@@ -95,7 +97,7 @@ class StoredLaunch:
 
 @contextlib.contextmanager
 def _named(function: Callable, name: str) -> Iterator[None]:
-    """Give a function another name, by which Taichi calls what it compiles."""
+    """Rename a function temporarily; Taichi uses the name for the compiled code."""
     usual, function.__name__ = function.__name__, name
     try:
         yield
@@ -104,12 +106,12 @@ def _named(function: Callable, name: str) -> Iterator[None]:
 
 
 def words_of(key: str) -> tuple[int, ...]:
-    """Return a key in numbers of 28 bits."""
+    """Return a key as numbers of 28 bits."""
     return tuple(int(key[i : i + 7], 16) for i in range(0, len(key), 7))
 
 
 def stub_kernel(key: str) -> Callable[..., None]:
-    """Return the stub of a key; each key makes another kernel for Taichi."""
+    """Return the stub of a key; each key gives a different kernel for Taichi."""
     words = words_of(key)
 
     def stub(numbers: RunReals, counts: RunInts, frame_buffer: FrameBuffer, frame_stats: FrameStats):
@@ -122,10 +124,10 @@ def stub_kernel(key: str) -> Callable[..., None]:
 
 
 def kernel_key(kind: CompiledKind, backend: Backend, runs: int) -> str:
-    """Return a key of all that the kernel of a batch is made from, with its fields in their places."""
+    """Return a key of all inputs of the kernel of a batch, including the memory layout of its fields."""
     ti.lang.impl.get_runtime().materialize()
     config = ti.lang.impl.current_cfg()
-    # Those that no code depends on, of which Taichi leaves one as memory was.
+    # Settings that do not affect code are excluded; Taichi leaves one of them uninitialised.
     beside = ("_", "print_", "offline_cache")
     settings = [(name, str(getattr(config, name))) for name in dir(config) if not name.startswith(beside)]
     facts = (kind, backend, runs, settings, _layout(), _machine(), _sources())
@@ -133,7 +135,7 @@ def kernel_key(kind: CompiledKind, backend: Backend, runs: int) -> str:
 
 
 def _layout() -> list[tuple]:
-    """Return where all fields are: of each node of Taichi's trees what it is, its size, and its place in its parent."""
+    """Return the memory layout of all fields: kind, number of children, size and offset of each node of Taichi."""
     program = ti.lang.impl.get_runtime().prog
     found = []
     waiting = [program.get_snode_root(tree) for tree in range(program.get_snode_tree_size())]
@@ -148,7 +150,7 @@ def _layout() -> list[tuple]:
 
 @cache
 def _machine() -> tuple:
-    """Return the versions, and the features of the processor, that kernels depend on."""
+    """Return the versions and processor features on which kernels depend."""
     features = platform.processor()
     with contextlib.suppress(OSError):
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
@@ -157,19 +159,19 @@ def _machine() -> tuple:
 
 
 def _files() -> list[Path]:
-    """Return the modules that kernels are made from."""
+    """Return the modules from which kernels are generated."""
     return sorted([*PACKAGE.glob("*.py"), *(path for part in SOURCES for path in (PACKAGE / part).rglob("*.py"))])
 
 
 def _unchanged_since(began: float) -> bool:
-    """Return whether they are files that are older than this process, s, and so what it has imported."""
+    """Return whether these modules are files older than this process, s, and hence equal to the imported ones."""
     found = [os.stat(path) for path in _files()]
     return bool(found) and all(max(one.st_mtime, one.st_ctime) < began - CLOCKS for one in found)
 
 
 @cache
 def _sources() -> str:
-    """Return a digest of the modules that kernels are made from, without their prose."""
+    """Return a digest of the modules from which kernels are generated, without docstrings and comments."""
     digest = hashlib.sha256()
     for path in _files():
         digest.update(f"{path.relative_to(PACKAGE)}\0".encode() + PROSE.sub(b"", path.read_bytes()) + b"\0")
@@ -177,29 +179,29 @@ def _sources() -> str:
 
 
 def store_compiled() -> None:
-    """Let stubs be the kernels that this process has compiled; Taichi has written the files of both."""
+    """Replace the files of stubs by those of the kernels compiled in this process, after Taichi has written both."""
     while _compiled:
         key, (folder, began) = _compiled.popitem()
         with contextlib.suppress(OSError):
-            # Their files are new, unless a process was killed here.
+            # Their files are new, unless an earlier process was killed at this point.
             if not _store(key, folder, began - CLOCKS):
                 _store(key, folder, 0.0)
 
 
 def _store(key: str, folder: Path, since: float) -> bool:
-    """Let the stub of a key be its kernel, if both are among the files that were written since then, s."""
+    """Replace the stub of a key by its kernel if both were written since a time, s; return whether they were found."""
     paths = [path for path in folder.glob("*.tic") if path.stat().st_mtime >= since]
     contents = [(path, path.read_bytes()) for path in paths]
     kernels = [one for _, one in contents if f"launch_{key}".encode() in one and _is_sound(one)]
     stubs = [path for path, one in contents if f"stub_{key}".encode() in one]
     if len(kernels) == 1 and stubs:
         _write(stubs[0], kernels[0])
-    # Two are a kernel and its stub, which another process has replaced.
+    # Two kernel files are the kernel and its stub, already replaced by another process.
     return bool(kernels and (stubs or kernels[1:]))
 
 
 def _is_sound(content: bytes) -> bool:
-    """Return whether a file of Taichi has the checksum that it states."""
+    """Return whether the checksum of a Taichi file is correct."""
     if len(content) < HEAD.size + DIGEST:
         return False
     _, _, described, code = HEAD.unpack_from(content)
@@ -208,7 +210,7 @@ def _is_sound(content: bytes) -> bool:
 
 
 def _write(path: Path, content: bytes) -> None:
-    """Replace a file, or make it, at once; OSError: it could not be written, and is as it was."""
+    """Replace or create a file atomically; raise OSError if it cannot be written, and leave it unchanged."""
     part = path.parent / f"mpmcli-{os.getpid()}.part"
     try:
         part.write_bytes(content)

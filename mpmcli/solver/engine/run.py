@@ -1,4 +1,4 @@
-"""A run: a scene in one place of a batch, from its particles at time 0 to its last frame."""
+"""A run: a scene in one slot of a batch, from its particles at time 0 to its last frame."""
 
 import math
 import time
@@ -43,36 +43,36 @@ from mpmcli.solver.particles.state_bounds import StateBounds, state_bounds_of
 from mpmcli.solver.transfer.particle_update import NOT_LOST, SMALLEST_J
 from mpmcli.stability.limits import Limit, collider_limit, force_limit
 
-# Particle-steps of the first launch, wall time of the others, s, and the growth from one to the next. The bytes of a
-# run depend on none of them.
+# Particle-steps of the first launch, target wall time of later launches, s, and largest growth of steps from one launch
+# to the next. The results of a run do not depend on them.
 FIRST, LAUNCH, GROWTH = 1_000_000, 0.4, 4
 
 
 class LaunchBudget:
-    """How many `steps` a run may take in the next launch: its host may stop it within some tenths of a second."""
+    """The number of `steps` of the next launch, such that the host regains control within some tenths of a second."""
 
     def __init__(self, particles: int) -> None:
         self.steps = max(1, FIRST // particles)
 
     def took(self, steps: int, seconds: float) -> None:
-        """Take note of the last launch: its steps, and its wall time, s."""
+        """Update the budget from the steps and the wall time, s, of the last launch."""
         if steps > 0 and seconds > 0:
             self.steps = max(1, min(GROWTH * self.steps, int(LAUNCH * steps / seconds)))
 
 
 class Run:
-    """A scene in one place of a batch.
+    """A scene in one slot of a batch.
 
-    `frames` computes a run that is alone in its batch, `frames_of_all` several runs of a batch. What reads or steps a
-    run in other ways launches its batch, and may not be used for several.
+    `frames` computes a run that is alone in its batch, `frames_of_all` several runs of a batch. All other methods that
+    read or advance a run launch its batch, and must not be used with several runs.
 
     Attributes:
-        scene: what is computed.
-        batch, slot: where.
-        groups: the particles, a group for each law.
+        scene: the scene.
+        batch, slot: the batch, and the slot of the run in it.
+        groups: the particles, one group per law.
         particle_count: number of particles.
         first_step_seconds: wall time of the first launch, which compiles the kernels; 0 before it.
-        frame_seconds, frame_processor_seconds: wall and processor time spent so far on frames and ledger rows.
+        frame_seconds, frame_processor_seconds: wall and processor time spent so far on frames and ledger rows, s.
     """
 
     def __init__(
@@ -84,15 +84,15 @@ class Run:
         *,
         force: bool = False,
     ) -> None:
-        """Fill the place.
+        """Write the scene and its particles to the slot.
 
         Args:
-            slot: number of the place, whose last run has ended.
-            particles: one entry per body, in place of the scene's own sampling.
-            force: take time.step as it is, above the stable step too.
+            slot: index of the slot, whose last run has ended.
+            particles: one entry per source, instead of sampling the scene.
+            force: use time.step even above the stable step.
 
         Raises:
-            InputError: a particle is not in the domain.
+            InputError: a particle is outside the domain.
         """
         self.scene, self.batch, self.slot, self.backend = scene, batch, slot, batch.backend
         self.forced = force and scene.time.step != "auto"
@@ -109,12 +109,12 @@ class Run:
         self._place()
         if batch.device.grid.sparse:
             batch.occupy(first_nodes_of(np.concatenate([body.position for body in self._particles]), scene))
-        # Frames keep what they show of the particles at the start, which are on the device.
+        # The builder copies the data that it needs of the initial particles, which are now on the device.
         _ = self._builder
         self._particles = []
 
     def _place(self) -> None:
-        """Write what belongs to the scene, and let the next launch measure the state at time 0."""
+        """Write the data of the scene, and let the next launch measure the state at time 0."""
         scene, batch, state = self.scene, self.batch, self._state
         drives = Drives.of(scene, [group.bodies for group in self.groups])[1]
         end = scene.time.end
@@ -128,7 +128,7 @@ class Run:
         self._begun = self._resumed = False
 
     def _write_scene(self) -> None:
-        """Write what does not change during a run: domain, walls, colliders, emitters and bounds on the step."""
+        """Write the constants of a run: domain, walls, colliders, emitters and bounds on the step."""
         scene, device, state = self.scene, self.batch.device, self._state
         walls, colliders = (device.friction, device.moving, device.grid.period), (device.colliders, device.motion)
         for data in (*walls, *colliders, device.rigid, device.rigid_contact, device.contact):
@@ -147,11 +147,11 @@ class Run:
             state.sensitivity[g], state.hardening[g] = group.law.sensitivity, group.law.hardening
         begin_emission(self.batch, self.slot, scene, self._counts_of_sources)
 
-    # What a run is, and how far it has come.
+    # Properties and progress.
 
     @cached_property
     def _builder(self) -> FrameBuilder:
-        # Where the host forms the sums of the ledger it needs all that is summed.
+        # If the host computes the sums of the ledger, it needs all summed columns.
         columns = () if self.backend.on_cpu else ("affine", "deformation_gradient")
         return FrameBuilder(self.scene, self._particles, self.groups, columns)
 
@@ -162,44 +162,44 @@ class Run:
 
     @property
     def grid(self) -> object:
-        """The nodes of the batch, see `Grid`."""
+        """The grid of the batch."""
         return self.batch.device.grid
 
     @property
     def state(self) -> RunState:
-        """The numbers of the run, once it has begun; what is written there counts from the next step on."""
+        """The numbers of the run, after `begin`; changes take effect in the next step."""
         self.begin()
         return self._state
 
     @property
     def time(self) -> float:
-        """Time of the state, s, in double precision."""
+        """Time of the state in double precision, s."""
         return self._state.time
 
     @property
     def step_count(self) -> int:
-        """Steps taken."""
+        """Number of steps taken."""
         return int(self._state.step_count)
 
     @property
     def last_step(self) -> float:
-        """Size of the last step, s, 0 before the first."""
+        """Size of the last step, s; 0 before the first step."""
         return self._state.last_step
 
     @property
     def courant(self) -> float:
-        """Cells that the fastest node moved in the last step, which no particle exceeds."""
+        """Displacement of the fastest node in the last step, cells, an upper bound for all particles."""
         return self._state.courant
 
     @property
     def measure_seconds(self) -> float:
-        """Wall time spent so far on the limits that follow from measurements of the state, s."""
+        """Wall time spent so far on limits from measurements of the state, s."""
         return self._control.seconds if self._begun else 0.0
 
     # The time step.
 
     def limits(self) -> list[Limit]:
-        """Return every bound on the next step: of the speed as it is, of the rest as last measured."""
+        """Return all bounds on the next step: for the current speed, and otherwise from the last measurement."""
         state, limits = self.state, self._control.limits()
         value = min(min(limit.value for limit in limits), state.held)
         limits.append(Limit(self.batch.steps.speed_limit(state, value), "speed", ""))
@@ -210,7 +210,7 @@ class Run:
         return limits
 
     def limits_now(self) -> list[Limit]:
-        """Return every bound that follows from the state of the particles as it is, without storing it."""
+        """Return all bounds from the current state of the particles, without storing them."""
         self.begin()
         self._launch_alone(status=MEASURE, arrived=0)
         return self._control.limits_now()
@@ -221,26 +221,26 @@ class Run:
         return self._limit(*self.batch.steps.nearest(self.state))
 
     def stable_step(self) -> tuple[float, Limit]:
-        """Return the step to take, safety included, and the bound that sets it."""
+        """Return the next step, including the safety factor, and the bound that determines it."""
         step, code = self.batch.steps.stable_step(self.state)
         chosen = LIMITS[code] in ("maximum", "forced")
         return step, self._limit(step, code) if chosen else self.nearest_limit
 
     def _limit(self, value: float, code: int) -> Limit:
-        """Return a bound of `StepSize`."""
+        """Return a bound of `StepSize` as a `Limit`."""
         by_stiffness = LIMITS[code] == self._control.stiffest.name
         return Limit(value, LIMITS[code], self._control.stiffest.body if by_stiffness else "")
 
     # Frames.
 
     def frames(self, stop: Callable[[], bool] = lambda: False) -> Iterator[tuple[Frame, LedgerRow]]:
-        """Yield the state as it is and then one frame for each output time to come, with its ledger row.
+        """Yield the current state and then one frame for each later output time, with its ledger row.
 
-        The time left to the next frame is split into equal steps, so that frames land on their times. After `load` of
-        a state that was saved between frames, the frames that follow are yielded.
+        The time to the next frame is divided into equal steps, so that frames are exactly at their times. After `load`
+        of a state saved between frames, only later frames are yielded.
 
         Args:
-            stop: called before each launch but the first, where `save` may be called; True ends the run there.
+            stop: called before each launch except the first; it may call `save`. If it returns True, the run ends.
 
         Raises:
             UnstableRunError: a particle left the domain, was inverted or became non-finite.
@@ -248,7 +248,7 @@ class Run:
         """
         yield from self.begin_frames()
         while not self.ended:
-            # Frame 0 is always there, and what a launch has recorded is yielded before.
+            # Frame 0 always exists, and the frames recorded in a launch are yielded before.
             if self._begun and stop():
                 raise KeyboardInterrupt
             self.before_launch()
@@ -256,7 +256,7 @@ class Run:
             yield from self.after_launch()
 
     def begin_frames(self) -> Iterator[tuple[Frame, LedgerRow]]:
-        """Yield the state as it is, unless it is not known before a launch, or was loaded between frames."""
+        """Yield the current state, unless it requires a launch first or was loaded between frames."""
         resumed, self._resumed = self._resumed, False
         if self._begun and not resumed:
             yield self.frame()
@@ -274,7 +274,7 @@ class Run:
         return self._begun and self._recorder.index > self.scene.time.frames
 
     def before_launch(self) -> None:
-        """Let the next launch advance the run; the first one measures it, and shows what it begins with."""
+        """Let the next launch advance the run; the first launch measures the initial state and shows it."""
         if self._begun:
             self._state.status, self._state.budget = GOING, self._budget.steps
         if self._state.records:
@@ -282,7 +282,7 @@ class Run:
         self._launched = self.batch.seconds, self.step_count
 
     def after_launch(self) -> Iterator[tuple[Frame, LedgerRow]]:
-        """Yield the frames that a launch has reached, and do what it asks for."""
+        """Yield the frames that a launch has reached, and handle its requests."""
         if not self._begun:
             self._start()
             if self.backend.on_cpu:
@@ -299,7 +299,7 @@ class Run:
             yield from self._recorded()
         self._attend()
         if not self.backend.on_cpu and self._state.arrived:
-            # A particle that the last step has inverted would be found in the next one only.
+            # A particle inverted by the last step would be detected only in the next step.
             if not self._control.sound():
                 stop(self, self.last_step)
             index, taken = self._recorder.index, steps_of(self._state, self.step_count - self._recorder.steps)
@@ -312,7 +312,7 @@ class Run:
         return self.scene.time.end * index / self.scene.time.frames
 
     def _aim(self, *, anew: bool = True) -> None:
-        """Let the run go on to the time of the next frame, and begin to record steps for it where that is `anew`."""
+        """Set the target to the time of the next frame, and if `anew` reset the statistics of steps."""
         state = self._state
         state.frame = min(self._recorder.index, self.scene.time.frames)
         state.target = self._time_of(state.frame)
@@ -320,13 +320,13 @@ class Run:
             self.batch.steps.forget_steps(state)
 
     def _note_launch(self) -> None:
-        """Take note of how long the last launch took."""
+        """Update the budget and wall times after a launch."""
         seconds, steps = self._launched
         self._budget.took(self.step_count - steps, self.batch.seconds - seconds)
         self.first_step_seconds = self.first_step_seconds or self.batch.first_seconds
 
     def _recorded(self) -> Iterator[tuple[Frame, LedgerRow]]:
-        """Yield the frames that the last launch has recorded."""
+        """Yield the frames recorded in the last launch."""
         began, processor_began = time.perf_counter(), time.process_time()
         built = self._recorder.read(self._builder)
         self.frame_seconds += time.perf_counter() - began
@@ -334,7 +334,7 @@ class Run:
         yield from built
 
     def frame(self, index: int = 0, taken: StepsTaken = NO_STEPS) -> tuple[Frame, LedgerRow]:
-        """Return the state as a frame, and the ledger row for the steps taken.
+        """Return the state as a frame, and its ledger row with the steps `taken`.
 
         Raises:
             UnstableRunError: a particle is inverted or not finite.
@@ -349,7 +349,7 @@ class Run:
         return built
 
     def _read(self, arrays: FrameArrays) -> tuple[list[Sums], dict[str, np.ndarray]]:
-        """Fill all rows of a frame; return the sums of each group, and `Moment.loads`."""
+        """Fill all rows of a frame; return the sums of each group and `Moment.loads`."""
         loads, colliders = {}, self.batch.device.colliders
         if self.backend.on_cpu:
             sums = self._recorder.read_now(arrays, self._launch_alone)
@@ -374,35 +374,35 @@ class Run:
             stop(self, self.last_step)
         return sums, loads
 
-    # Beginning, and steps from outside.
+    # Start, and steps on request.
 
     def begin(self) -> None:
-        """Take the bounds of time 0; a second call does nothing."""
+        """Determine the bounds at time 0; a second call does nothing."""
         if not self._begun:
             self.batch.launch()
             self._start()
 
     def restart(self) -> None:
-        """Begin anew at time 0 with the particles as they are on the device, set from outside."""
+        """Restart at time 0 with the current particles on the device, which the caller has set."""
         self._forget_lost()
         self._place()
         self._recorder.index, self._builder.before = 0, 0.0
         self.begin()
 
     def _start(self) -> None:
-        """Take the bounds of time 0 from the measurement of the first launch."""
+        """Set the bounds at time 0 from the measurement of the first launch."""
         self.first_step_seconds = self.batch.first_seconds
         self._follow()
         self._control.begin()
         free = [each.fastest(self.scene.domain, 0.0) for each in self.scene.colliders if each.free]
         self._state.speed = max([self._control.speed, *free])
         self._measure_forces(0.0)
-        # Once more, with the step that says how far ahead the next measurement is.
+        # Again, because the step determines the time of the next measurement.
         self._measure_forces(self.stable_step()[0])
         self._state.first_stable_step = self.stable_step()[0]
 
     def _follow(self) -> None:
-        """Begin to follow the state from the measurement that the kernel made last."""
+        """Create the control of the step from the last measurement of the kernel."""
         measured = [partial(self._measured, g) for g in range(len(self.groups))]
         self._control = StepControl(self.scene, self.groups, self._state, measured)
         measures = [
@@ -414,14 +414,14 @@ class Run:
         self._begun = True
 
     def _measured(self, g: int) -> StateBounds:
-        """Return the bounds of the state of the g-th group as the kernel has measured them last."""
+        """Return the bounds of the state of the g-th group from the last measurement of the kernel."""
         return state_bounds_of(self.groups[g], list(self._state.maxima[g]))
 
     def step(self, dt: float, until: float | None = None) -> None:
-        """Advance by dt (s), whatever the bounds on the step.
+        """Advance by dt, s, regardless of the bounds on the step.
 
         Args:
-            until: the time after the step where that is known, s; a sum has rounding errors.
+            until: the time after the step, s, if known; the sum of time and step has rounding errors.
 
         Raises:
             UnstableRunError: a particle left the domain, was inverted or became non-finite.
@@ -433,7 +433,7 @@ class Run:
             self._state.given = 0.0
 
     def advance(self, count: int) -> tuple[int, float]:
-        """Take about `count` stable steps, whatever the times of frames are, for a measurement of speed.
+        """Take about `count` stable steps, regardless of the times of frames, to measure the speed.
 
         Returns:
             The number of steps taken, and the smallest one, s.
@@ -458,19 +458,19 @@ class Run:
             self._attend()
 
     def measure(self) -> None:
-        """Measure the state of all particles, and take the limits that follow."""
+        """Measure the state of all particles and update the limits."""
         self.begin()
         self._launch_alone(status=MEASURE, arrived=0)
         self._measure(range(len(self.groups)))
 
     def state_was_replaced(self) -> None:
-        """Sort and measure particles whose state was set from outside; none of them counts as lost."""
+        """Sort and measure particles whose state the caller has replaced; none of them counts as lost."""
         self._forget_lost()
         self.state.drift = math.inf
         self.measure()
 
     def _launch_alone(self, **counts: int) -> None:
-        """Launch with these counts, and leave all numbers as they were but what was measured."""
+        """Launch with these counts and restore all numbers except the measurement."""
         numbers, before = self.batch.numbers.copy(), self.batch.counts.copy()
         self.batch.state(slice(None)).status = IDLE
         for name, value in counts.items():
@@ -483,10 +483,10 @@ class Run:
             for g, maxima in enumerate(measured):
                 self._state.maxima[g] = maxima
 
-    # What the host does between launches.
+    # Work of the host between launches.
 
     def _attend(self) -> None:
-        """Do what the status asks for after a launch."""
+        """Handle the status of the run after a launch."""
         status = self._state.status
         if status in (LOST, COLLAPSED):
             self._state.status = IDLE
@@ -504,7 +504,7 @@ class Run:
             self._measure(due)
 
     def _measure(self, due: Sequence[int]) -> None:
-        """Take the measurement of some groups that the kernel has made after the last step."""
+        """Update the limits from the measurement of some groups by the kernel after the last step."""
         if not self._control.measure(due):
             stop(self, self.last_step)
         self._measure_forces(self.last_step)
@@ -512,7 +512,7 @@ class Run:
             self._state.speed = self._control.speed
 
     def _measure_forces(self, step: float) -> None:
-        """Measure forces up to the next measurement, which is so many steps (s) ahead at most."""
+        """Measure forces for the time until the next measurement, at most `state.longest` steps of `step`, s."""
         state, forces = self._state, self._forces
         push, slope = forces.measure(state.time, state.longest * step)
         gravity = self.scene.domain.gravity_at(0.0) if self.scene.domain.steady else [0.0]
@@ -521,18 +521,18 @@ class Run:
             state.force = force_limit(slope)
 
     def _fill_tables(self) -> None:
-        """Let the kernel go on from the time that velocities have."""
+        """Fill the time tables from the time of the velocities on."""
         since = self._state.velocity_time
-        # The same time again: the next kick takes more windows than found room.
+        # The same time again means that the next kick spans more windows than were stored.
         self._coarse, self._filled_since = since == self._filled_since, since
         self._state.horizon = self._tables.fill(self.slot, self._means, since, coarse=self._coarse)
 
-    # States.
+    # Saved states.
 
     def save(self) -> SavedState:
-        """Return the state of the only run of a batch, where `stop` of `frames` is called, or between steps.
+        """Return the state of the only run of a batch, when `stop` of `frames` is called or between steps.
 
-        Its arrays are copied from the device one by one as they are asked for, which is over when the next step begins.
+        Its arrays are copied from the device one by one when accessed, and are valid until the next step.
         """
         self.begin()
         numbers = {
@@ -543,10 +543,10 @@ class Run:
         return SavedState(numbers, read_batch(self.batch))
 
     def load(self, saved: SavedState) -> None:
-        """Go on from a saved state of the same scene, or of one that ends earlier, as the only run of a batch.
+        """Continue from a saved state of the same scene, or of one with an earlier end, as the only run of a batch.
 
         Raises:
-            InputError: it is of another scene, or of another kind of backend.
+            InputError: the state belongs to another scene or to another kind of backend.
         """
         write_batch(self.batch, saved.arrays)
         self._forget_lost()
@@ -558,17 +558,17 @@ class Run:
         self._recorder.index, self._recorder.steps, self._builder.before = saved.numbers["frames"]
         self._resumed = self._recorder.index > 0
         if not self.backend.on_cpu:
-            # There particles are sorted anew.
+            # A GPU sorts the particles again.
             self._state.drift = math.inf
         elif self._resumed:
             self._recorder.start(self._builder.columns)
         if self._resumed:
             self._aim(anew=self._state.arrived == 1 and not self.ended)
 
-    # How a run ends before its time.
+    # Lost particles.
 
     def _forget_lost(self) -> None:
-        """Let no particle count as lost."""
+        """Reset the records of lost particles."""
         lost, first = self.batch.device.particles.lost, self.slot * len(self.groups)
         for g in range(len(self.groups)):
             lost[first + g] = NOT_LOST
@@ -576,20 +576,20 @@ class Run:
             self.grid.fixed.forget(self.slot)
 
     def lost(self) -> list[int | None]:
-        """Return a lost particle of each group, in solver order, None where none is known."""
+        """Return a lost particle of each group, in solver order, or None."""
         count = len(self.groups)
         found = self.batch.device.particles.lost.to_numpy()[self.slot * count :][:count]
         if self.grid.deterministic:
-            # There it is the id, as the order depends on atomics.
+            # The record is an id, because the order depends on atomics.
             rows = [np.flatnonzero(group.read()["id"] == p) for group, p in zip(self.groups, found, strict=True)]
             return [int(p[0]) if len(p) else None for p in rows]
         return [None if p == NOT_LOST else int(p) - group.first for p, group in zip(found, self.groups, strict=True)]
 
 
 def frames_of_all(runs: Mapping[int, Run]) -> Iterator[tuple[int, tuple[Frame, LedgerRow] | Exception | None]]:
-    """Yield the frames of runs that share a batch as they come, each with the key of its run.
+    """Yield the frames of runs that share a batch as they are computed, each with the key of its run.
 
-    None follows on the last one of a run, or the error that ended it.
+    The last frame of a run is followed by None, or by the error that ended the run.
     """
     going = dict(runs)
     for key, run in runs.items():
@@ -613,7 +613,7 @@ def frames_of_all(runs: Mapping[int, Run]) -> Iterator[tuple[int, tuple[Frame, L
                 yield key, None
 
 
-# On a GPU, where runs advance at once.
+# Number of particles below which runs on a GPU are faster in a batch, where they advance concurrently.
 FEW_ON_GPU = 100_000
 
 
@@ -625,11 +625,11 @@ def backend_for(
     *,
     compile_cache: bool = True,
 ) -> Backend:
-    """Return the backend for a scene, not started.
+    """Return the backend for a scene without starting it.
 
     Args:
-        expected_steps: their number; called on the CPU only.
-        threads: CPU threads; None for as many as the scene has use for.
+        expected_steps: returns the expected number of steps; called only on the CPU.
+        threads: number of CPU threads; None for as many as are useful.
 
     Raises:
         InputError: the backend cannot be used.
@@ -642,21 +642,21 @@ def backend_for(
 
 
 def suits_batch(particles: int, backend: Backend) -> bool:
-    """Return whether many runs of so many particles are faster in one batch than one by one."""
+    """Return whether many runs with this number of particles are faster in one batch than one by one."""
     return backend.on_cpu or particles < FEW_ON_GPU
 
 
 def build_run(
     scene: Scene, backend: Backend, particles: list[BodyParticles] | None = None, *, force: bool = False
 ) -> Run:
-    """Put a scene on the device of a started backend, alone.
+    """Return the run of a scene, alone in a batch, on a started backend.
 
     Args:
-        particles: one entry per body, in place of the scene's own sampling.
-        force: take time.step as it is, above the stable step too.
+        particles: one entry per source, instead of sampling the scene.
+        force: use time.step even above the stable step.
 
     Raises:
-        InputError: a particle is not in the domain, or the backend cannot compute the scene.
+        InputError: a particle is outside the domain, or the backend cannot compute the scene.
     """
     require_contact_possible(scene, backend)
     particles = particles or sample_bodies(scene)

@@ -1,4 +1,4 @@
-"""The particles of one law of one run: what its bodies begin with, and what can be read and replaced."""
+"""The particles of one law of one run: initial states of its bodies, and access to the current state."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
@@ -15,7 +15,7 @@ from mpmcli.solver.machine.plan import members_of
 from mpmcli.solver.particles.state_bounds import floor_of
 from mpmcli.solver.transfer.particle_update import NOT_LOST
 
-# Particles that the device takes at once.
+# Particles per copy to the device.
 PART = 2**15
 
 
@@ -31,11 +31,18 @@ def initial_states(
     origin: np.ndarray,
     surfaces: Sequence[np.ndarray],
 ) -> Iterator[tuple[int, dict[str, np.ndarray], np.ndarray]]:
-    """Yield the particles of some bodies, PART at a time, which bounds the memory.
+    """Yield the initial particles of some bodies, PART at a time, which bounds the memory.
 
-    first_ids: id of the first particle of each body; origin: of the domain, (d,), m; surfaces: what the particles of
-    each body carry, see `rest_surface`, empty where they carry nothing. Yields the number of those before, and what
-    `ParticleArrays.write` takes; its rows count from the first body.
+    Args:
+        law: the law of the bodies.
+        particles: particles of each body.
+        first_ids: id of the first particle of each body.
+        origin: origin of the domain, (d,), m.
+        surfaces: surface data of the particles of each body, see `rest_surface`; empty without surfaces.
+
+    Yields:
+        The number of particles before, and the arguments `found` and `row` of `ParticleArrays.write`, with rows
+            relative to the first body.
     """
     rest = np.ones(1) if law.deformation == "J" else np.eye(len(origin))[None]
     at_rest = [float(variable.at_rest) for variable in law.internal]
@@ -62,14 +69,18 @@ def initial_states(
 
 
 class RunGroup:
-    """The particles of one law of one run, a range of `ParticleArrays`.
+    """The particles of one law of one run: a range of `ParticleArrays`.
 
     Attributes:
-        law: with the parameters of this run; bodies: index in the scene of each body of the group.
-        arrays: the fields; first: its first particle there; count: particles n; row: its first row of `table`.
-        rows: host copy of its rows of `table`.
-        floor: the least maxima of a measurement, where particles may come in; None elsewhere.
-        total, dimension, real, internal: of the arrays.
+        law: the law with the parameters of this run.
+        bodies: index in the scene of each body of the group.
+        arrays: the fields.
+        first: index of the first particle in the fields.
+        count: number of particles n.
+        row: first row in `table`.
+        rows: host copy of the rows of `table`.
+        floor: lower bounds of the maxima of a measurement if particles come and go, else None.
+        total, dimension, real, internal: attributes of the arrays.
     """
 
     def __init__(self, batch: Batch, g: int, slot: int, law: Law, bodies: list[int], rows: np.ndarray, count: int):
@@ -85,17 +96,17 @@ class RunGroup:
 
     @property
     def active(self) -> int:
-        """Particles that take part, which come first."""
+        """Number of active particles, which precede all others."""
         return self._state.particles[self._number]
 
     def read(self) -> dict[str, np.ndarray]:
-        """Return x, v, C, deformation, internal, (n, k), id and body, (n), in the solver's order."""
+        """Return x, v, C, deformation, internal, (n, k), id and body, (n), in solver order."""
         return self.arrays.read(self.first, self.count, self.bodies, self.row)
 
     def replace(self, **state: np.ndarray) -> None:
-        """Replace some of what `read` returns of all particles: x, v, C, deformation, internal or id.
+        """Replace x, v, C, deformation, internal or id of all particles, in the form of `read`.
 
-        `Run.state_was_replaced`, or `Run.restart`, follows.
+        `Run.state_was_replaced` or `Run.restart` must follow.
         """
         arrays, d = self.arrays, self.dimension
         if "x" in state:
@@ -103,7 +114,7 @@ class RunGroup:
         if "v" in state:
             self._assign(arrays.v, np.asarray(state["v"]))
         if "C" in state:
-            # What rounding took from places is forgotten.
+            # The remainders of positions are reset.
             gradient = np.zeros((self.count, d, arrays.gradient.m))
             gradient[:, :, :d] = np.asarray(state["C"]).transpose(0, 2, 1)
             self._assign(arrays.gradient, gradient)
@@ -121,13 +132,13 @@ class RunGroup:
             self._assign(arrays.id, np.asarray(state["id"]))
 
     def _assign(self, field: ti.Field, values: np.ndarray) -> None:
-        """Set the range of the group in a field."""
+        """Set the entries of the group in a field."""
         whole = field.to_numpy()
         whole[self.first : self.first + self.count] = values
         field.from_numpy(whole)
 
     def fill(self, states: Iterable[tuple[int, Mapping[str, np.ndarray], np.ndarray]], layers: Layers) -> None:
-        """Fill the device with particles, see `initial_states`, in the layers of their bodies."""
+        """Write particles (see `initial_states`), the table and the layers of bodies to the device."""
         for first, found, row in states:
             self.arrays.write(self.first + first, found, self.row + row)
         for i, row in enumerate(self.rows):
@@ -137,7 +148,7 @@ class RunGroup:
 
 
 def groups_of(batch: Batch, slot: int, scene: Scene, particles: Sequence[BodyParticles]) -> list[RunGroup]:
-    """Put the particles of a run, one entry per source, on the device; return its groups, one for each law."""
+    """Write the particles of a run, one entry per source, to the device; return its groups, one per law."""
     first_ids = np.concatenate([[0], np.cumsum([len(b.position) for b in particles])])
     lost, groups, layers = batch.device.particles.lost, [], Layers.of(scene)
     state = batch.state(slot)
@@ -165,7 +176,7 @@ def groups_of(batch: Batch, slot: int, scene: Scene, particles: Sequence[BodyPar
 
 
 def require_inside(scene: Scene, particles: Sequence[BodyParticles]) -> None:
-    """Refuse particles beyond the domain, or nowhere: the sort would count them in a tile that does not exist."""
+    """Raise an InputError for particles outside the domain or at NaN; the sort would count them in missing tiles."""
     lower, upper = np.array(scene.domain.origin), np.array(scene.domain.upper)
     for sample in particles:
         inside = ((sample.position >= lower) & (sample.position <= upper)).all(axis=1)
@@ -174,5 +185,5 @@ def require_inside(scene: Scene, particles: Sequence[BodyParticles]) -> None:
             place, low, high = (", ".join(f"{x:.6g}" for x in point) for point in (sample.position[p], lower, upper))
             raise InputError(
                 f'particle {p} of body "{sample.name}" lies at ({place}) m, outside the domain from ({low}) to '
-                f"({high}) m; every particle must begin inside it."
+                f"({high}) m; every particle must start inside it."
             )

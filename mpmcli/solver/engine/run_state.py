@@ -1,8 +1,8 @@
-"""The numbers of a run that its host and its kernels share: each has a name, a type, and one of the two that writes it.
+"""The numbers of a run shared by its host and its kernels, each with a name, a type and a writer.
 
-They lie in arrays with a row for each run of a batch: `numbers`, float64, and `counts`, int32, in memory that both see;
-and `step`, of the step under way, in the precision of particles and on the device alone. A number is added by a line of
-RUN or STEP: kernels and host then read and write it as `run.name`, and it is saved and loaded.
+They are stored in arrays with a row for each run of a batch: `numbers`, float64, and `counts`, int32, in memory shared
+by host and kernels; and `step`, for the current step, in the precision of particles and only on the device. A line in
+RUN or STEP adds a number: kernels and host then access it as `run.name`, and it is saved and loaded.
 """
 
 import math
@@ -15,30 +15,30 @@ from mpmcli.quick_taichi import ti
 from mpmcli.solver.particles.state_bounds import ENTRIES
 
 Columns = int | range | tuple[range, ...]
-# Status of a run: free, or waiting for the host; to be measured; advancing; measured, as a bound on its step requires,
-# at its target, or with no room for frames left; with lost particles; with a stable step that collapsed; before a kick
-# that ends beyond its time tables; before a sort after which particles reach more blocks of nodes than fit.
+# Status of a run: idle (free, or waiting for the host); to be measured; advancing; measured, because a bound on its
+# step requires it, the target is reached, or no space for frames is left; with lost particles; with a collapsed stable
+# step; before a kick that ends beyond its time tables; before a sort with more blocks of nodes than are allocated.
 IDLE, MEASURE, GOING, ATTEND, LOST, COLLAPSED, BEYOND, CROWDED = range(8)
-# Bounds on the step by their code; of equal ones the lower code counts, as in a comparison of `Limit`s.
+# Bounds on the step by their code; of equal ones the lower code is reported, as in a comparison of `Limit`s.
 LIMITS = ("", "collider", "deformation", "force", "forced", "maximum", "speed", "viscosity", "wave")
-# What a frame takes of the numbers of its run, as float64, before the sums of each group.
+# Numbers of the run that are stored with a frame, as float64, before the sums of each group.
 FRAME_NUMBERS = (
     *("time", "step_count", "last_step", "smallest", "smallest_courant", "largest", "largest_courant", "limit"),
     "blocked",
 )
-# Most frames that a launch records of a run.
+# Largest number of frames that a launch records per run.
 MOST_FRAMES = 128
 
 
 class Entry(NamedTuple):
-    """A number of a run, or several under one name.
+    """One or several numbers of a run under one name.
 
     Attributes:
         type: float or int.
-        writer: "scene", once for each scene; "host", between launches; "kernel".
-        start: at time 0; None: what writes it sets it before.
-        per: what there is one of for each: "axis", "group", "emitter"; "body" of each group, and "maximum" of each
-            group, see `state_bounds`: those have the first of them for each group. "": there is one.
+        writer: "scene", written once per scene; "host", written between launches; or "kernel".
+        start: value at time 0; None if the writer sets it before.
+        per: "" for one number, or "axis", "group" or "emitter" for one per item; "body" (of each group) and "maximum"
+            (of each group, see `state_bounds`) have a range of columns per group.
     """
 
     type: type
@@ -57,123 +57,123 @@ def _int(writer: str, start: float | None = 0, per: str = "") -> Entry:
 
 RUN: Mapping[str, Entry] = {
     # The scene.
-    "spacing": _real("scene"),  # of the grid, m
+    "spacing": _real("scene"),  # spacing of the grid, m
     "inverse_spacing": _real("scene"),  # 1/m
     "gradient_scale": _real("scene"),  # see `Grid`, 1/m
-    "extent": _real("scene", per="axis"),  # of the domain, m
+    "extent": _real("scene", per="axis"),  # size of the domain, m
     "cells": _int("scene", per="axis"),
-    "gravity": _real("scene", per="axis"),  # at time 0, m/s^2
-    "wall_speed": _real("scene"),  # of the fastest wall, m/s
-    "slowest": _real("scene"),  # least speed that counts: that of the fastest emitter, m/s
+    "gravity": _real("scene", per="axis"),  # gravity at time 0, m/s^2
+    "wall_speed": _real("scene"),  # speed of the fastest wall, m/s
+    "slowest": _real("scene"),  # lower bound of the speed: that of the fastest emitter, m/s
     "end": _real("scene"),  # time, s
-    "frames": _int("scene"),  # number of output times behind time 0
+    "frames": _int("scene"),  # number of output times after time 0
     "safety": _real("scene"),  # time.safety
     "maximum": _real("scene", math.inf),  # time.step, s
-    "forced": _int("scene"),  # whether the maximum is taken above the stable step, too
+    "forced": _int("scene"),  # whether the maximum is used even above the stable step
     "collider": _real("scene", math.inf),  # bound on the step by colliders, s
-    "capacity": _int("scene", None, "group"),  # particles, those that wait included
-    "sensitivity": _real("scene", per="group"),  # of stiffness to strain, see `Law`
+    "capacity": _int("scene", None, "group"),  # particles, including waiting ones
+    "sensitivity": _real("scene", per="group"),  # sensitivity of stiffness to strain, see `Law`
     "hardening": _real("scene", per="group"),
-    "period": _real("scene", per="emitter"),  # between two sheets, s
-    "until": _real("scene", per="emitter"),  # when the last one enters, s
-    "sheets": _int("scene", per="emitter"),  # number of them
-    # How far the run has come.
+    "period": _real("scene", per="emitter"),  # time between two sheets, s
+    "until": _real("scene", per="emitter"),  # time from which no sheet enters, s
+    "sheets": _int("scene", per="emitter"),  # number of sheets
+    # Progress of the run.
     "time": _real("kernel"),  # s
     "step_count": _real("kernel"),
     "last_step": _real("kernel"),  # s
-    "kick_carry": _real("kernel"),  # time by which velocities lag behind the middle of the last step, s
-    "speed": _real("kernel"),  # bound on that of every particle, m/s
-    "courant": _real("kernel"),  # cells that the fastest node moved in the last step
-    "drift": _real("kernel", math.inf),  # cells that a particle may have moved since the last sort
-    "unrelaxed": _real("kernel"),  # time since volumes were relaxed, s
+    "kick_carry": _real("kernel"),  # lag of velocities behind the middle of the last step, s
+    "speed": _real("kernel"),  # bound on the speed of every particle, m/s
+    "courant": _real("kernel"),  # displacement of the fastest node in the last step, cells
+    "drift": _real("kernel", math.inf),  # bound on the displacement of particles since the last sort, cells
+    "unrelaxed": _real("kernel"),  # time since the last relaxation of volumes, s
     "unrelaxed_steps": _int("kernel"),
     "rate": _real("kernel", per="group"),  # largest rate of deformation in the last step, 1/s
-    "particles": _int("kernel", None, "group"),  # those that take part
-    "blocked": _int("kernel"),  # particles of emitters that found no room
-    "due": _real("kernel", math.inf),  # when the next sheet of any emitter enters, s
+    "particles": _int("kernel", None, "group"),  # active particles
+    "blocked": _int("kernel"),  # blocked particles of emitters
+    "due": _real("kernel", math.inf),  # time of the next sheet of any emitter, s
     "due_of": _real("kernel", per="emitter"),
-    "entered": _int("kernel", per="emitter"),  # number of sheets
-    "waits": _int("kernel", per="emitter"),  # whether the next one does, for lack of room
+    "entered": _int("kernel", per="emitter"),  # number of entered sheets
+    "waits": _int("kernel", per="emitter"),  # whether the next layer is blocked
     # Bounds on the next step.
-    "stiffness": _real("host", math.inf),  # by the laws as last measured, s
-    "stiffness_limit": _int("host"),  # its code in LIMITS
+    "stiffness": _real("host", math.inf),  # bound by the laws from the last measurement, s
+    "stiffness_limit": _int("host"),  # code of this bound in LIMITS
     "pull": _real("host"),  # bound on the acceleration by forces and steady gravity, m/s^2
-    "force": _real("host", math.inf),  # bound by the slope of forces, s
-    "first_stable_step": _real("host"),  # at time 0, s
+    "force": _real("host", math.inf),  # bound by the gradient of forces, s
+    "first_stable_step": _real("host"),  # stable step at time 0, s
     "own": _real("host", None, "body"),  # bound by the stiffness of each body, s
-    "horizon": _real("host", -math.inf),  # time up to which time tables are filled, s
-    "held": _real("kernel", math.inf),  # the bound that rises late, see `StepSize.limit_rise`, s
-    "low": _real("kernel", math.inf),  # the least of this series of steps, s
-    "low_before": _real("kernel", math.inf),  # and of the one before
+    "horizon": _real("host", -math.inf),  # end of the filled time tables, s
+    "held": _real("kernel", math.inf),  # the bound with a delayed rise, see `StepSize.limit_rise`, s
+    "low": _real("kernel", math.inf),  # the smallest bound in this series of steps, s
+    "low_before": _real("kernel", math.inf),  # the smallest bound in the previous series, s
     "held_steps": _real("kernel"),  # steps of this series
     # When to measure the state again.
-    "longest": _int("host"),  # most steps between two measurements
-    "growth_allowed": _real("host"),  # of the logarithm of a stiffness
+    "longest": _int("host"),  # largest number of steps between two measurements
+    "growth_allowed": _real("host"),  # permitted growth of the logarithm of a stiffness
     "unwatched": _int("kernel", per="group"),  # steps since the last measurement
-    "change": _real("kernel", per="group"),  # growth of that logarithm since, by deformation
-    "hardened": _real("kernel", per="group"),  # and by hardening
-    # What the host asks for.
+    "change": _real("kernel", per="group"),  # growth of that logarithm since then, by deformation
+    "hardened": _real("kernel", per="group"),  # the same, by hardening
+    # Requests of the host.
     "status": _int("host"),
-    "target": _real("host"),  # time to reach, s
-    "given": _real("host"),  # a step, s, 0 where the kernel chooses it
+    "target": _real("host"),  # target time, s
+    "given": _real("host"),  # a prescribed step, s, 0 if the kernel chooses it
     "budget": _int("host"),  # steps that may be taken in this launch
     "arrived": _int("kernel"),  # whether the target is reached
-    # The step under way.
+    # The current step.
     "dt": _real("kernel"),  # s
     "kick": _real("kernel"),  # s
     "stable": _real("kernel"),  # the largest stable step, s
     "relaxed": _real("kernel"),  # time over which volumes relax, s, 0 in most steps
-    "steps_to_target": _real("kernel"),  # equal ones, from the start of this one
+    "steps_to_target": _real("kernel"),  # number of equal steps, including this one
     "deformation": _real("kernel"),  # bound by deformation, s
     "step_limit": _int("kernel"),  # code of the bound that sets it
     # The steps since the last frame, for the ledger.
     "smallest": _real("kernel", math.inf),  # s
-    "smallest_courant": _real("kernel"),  # of the smallest step
-    "limit": _int("kernel"),  # code of its bound
+    "smallest_courant": _real("kernel"),  # Courant number of the smallest step
+    "limit": _int("kernel"),  # code of the bound of the smallest step
     "largest": _real("kernel"),  # s
     "largest_courant": _real("kernel"),
     # Frames that the kernel records.
-    "records": _int("host"),  # whether it does
-    "frame": _int("kernel"),  # number of the next one
-    "frame_recorded": _int("kernel"),  # whether it was recorded and no step taken since
-    "recorded": _int("kernel"),  # number of those of this launch
-    "frame_capacity": _int("host"),  # most frames of this launch
-    "row": _int("kernel"),  # of the frame buffer, the next one to be filled
-    "affine": _int("host"),  # columns there
+    "records": _int("host"),  # whether the kernel records frames
+    "frame": _int("kernel"),  # index of the next frame
+    "frame_recorded": _int("kernel"),  # whether a frame was recorded and no step taken since
+    "recorded": _int("kernel"),  # number of frames recorded in this launch
+    "frame_capacity": _int("host"),  # largest number of frames in this launch
+    "row": _int("kernel"),  # next row of the frame buffer
+    "affine": _int("host"),  # first columns in the frame buffer, -1 if omitted
     "gradient": _int("host"),
     "tau": _int("host"),
     "activity": _int("host"),
-    # The last measurement; behind all others.
+    # The last measurement; after all other numbers.
     "maxima": _real("kernel", None, "maximum"),
 }
 STEP: Mapping[str, Entry] = {
-    "spacing": _real("host"),  # of the grid, m
+    "spacing": _real("host"),  # spacing of the grid, m
     "inverse_spacing": _real("host"),
     "gradient_scale": _real("host"),
-    "extent": _real("host", per="axis"),  # of the domain, m
+    "extent": _real("host", per="axis"),  # size of the domain, m
     "dt": _real("kernel"),  # s
     "kick": _real("kernel"),  # s
     "stable": _real("kernel"),  # the largest stable step, s
     "relaxed": _real("kernel"),  # time over which volumes relax, s, 0 in most steps
-    "gravity": _real("kernel", per="axis"),  # change of velocity by it, m/s
-    "speed_squared": _real("kernel"),  # of the fastest node, m^2/s^2
+    "gravity": _real("kernel", per="axis"),  # change of velocity by gravity, m/s
+    "speed_squared": _real("kernel"),  # squared speed of the fastest node, m^2/s^2
     "rate": _real("kernel", per="group"),  # largest rate of deformation, 1/s
-    "volume_change": _real("kernel", per="group"),  # of the logarithm of a volume by relaxation
+    "volume_change": _real("kernel", per="group"),  # largest change of the logarithm of a volume by relaxation
 }
 
 
 class Layout:
-    """The columns of the arrays for runs in d dimensions with some laws.
+    """Columns of the arrays for runs in d dimensions with some laws.
 
     Attributes:
-        bodies: of each law.
-        numbers, counts, step: the columns of each array by name: one; a range, one for each axis, group or emitter; or
-            a range for each group.
+        bodies: number of bodies per law.
+        numbers, counts, step: columns of each array by name: one column; a range with a column per axis, group or
+            emitter; or a range per group.
         widths: number of columns of each array, by its name.
     """
 
     def __init__(self, dimension: int, internal: Sequence[int], emitters: int = 0, bodies: Sequence[int] = ()) -> None:
-        """Assign columns; `internal` are the numbers of internal variables of the laws, `bodies` of bodies."""
+        """Assign columns, given the number of internal variables and of bodies of each law."""
         self.bodies = tuple(bodies)
         several = {"axis": dimension, "group": len(internal), "emitter": emitters}
         of_groups = {"body": self.bodies, "maximum": [ENTRIES + 2 * n for n in internal]}
@@ -196,13 +196,13 @@ class Layout:
         self.step = columns("step", STEP)
 
     def of_scene(self, array: str) -> list[int]:
-        """Return the columns of "numbers" or "counts" that the scene writes."""
+        """Return the columns of "numbers" or "counts" that are written once per scene."""
         found = [columns for name, columns in getattr(self, array).items() if RUN[name].writer == "scene"]
         return [k for columns in found for k in ([columns] if isinstance(columns, int) else columns)]
 
 
 def _entry(array: object, w: object, column: object) -> object:
-    """Return a number: an expression in a kernel, else a number of Python, or an array for several runs."""
+    """Return a number: an expression in a kernel, otherwise a Python number, or an array for several runs."""
     if inside_kernel():
         return subscript(None, array, w, column)
     found = array[w, column]
@@ -210,7 +210,7 @@ def _entry(array: object, w: object, column: object) -> object:
 
 
 class Several:
-    """Numbers of a run under one name, by their number among them."""
+    """Several numbers of a run under one name, by index."""
 
     def __init__(self, array: object, w: object, columns: range | tuple[range, ...]) -> None:
         self._array, self._w, self._columns = array, w, columns
@@ -232,7 +232,7 @@ class Several:
 
 
 class _Named:
-    """Numbers of run `w` by their names in tables of columns, each of an array."""
+    """Numbers of run `w` by name, in arrays with tables of columns."""
 
     def __init__(self, w: object, *tables: tuple[Mapping[str, Columns], object]) -> None:
         self.__dict__.update(w=w, _tables=tables)
@@ -255,9 +255,9 @@ class _Named:
 
 
 class RunState(_Named):
-    """The numbers of run `w` of a batch, see RUN: a row of arrays on the host; or in a kernel, `w` being a variable.
+    """The numbers of run `w` of a batch, see RUN: rows of arrays on the host, or in a kernel, where `w` is a variable.
 
-    On the host `w` may be `slice(None)`: each number is then an array with an entry for each run.
+    On the host `w` may be `slice(None)`: each number is then an array with an entry per run.
     """
 
     def __init__(self, layout: Layout, numbers: object, counts: object, w: object) -> None:
@@ -265,18 +265,18 @@ class RunState(_Named):
 
     @property
     def velocity_time(self) -> object:
-        """Time to which velocities have advanced, s: the middle of the last step, less what they lag behind it."""
+        """Time of the velocities, s: the middle of the last step minus their lag."""
         return self.time - 0.5 * self.last_step - self.kick_carry
 
     def reset(self) -> None:
-        """Begin a run on the host: set what has a value at time 0."""
+        """Set all numbers with a start value, on the host."""
         for name, entry in RUN.items():
             if entry.start is not None:
                 setattr(self, name, entry.start)
 
 
 class StepState(_Named):
-    """The numbers of the step under way of run `w` in a kernel, see STEP; `w` being a variable."""
+    """The numbers of the current step of run `w` in a kernel, see STEP; `w` is a variable."""
 
     def __init__(self, layout: Layout, field: ti.Field, w: object) -> None:
         super().__init__(w, (layout.step, field))

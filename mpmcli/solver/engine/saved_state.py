@@ -1,4 +1,4 @@
-"""The state of a run, everything that its next step depends on, saved and loaded as one."""
+"""Saves and loads the state of a run: everything that its next step depends on."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -17,29 +17,30 @@ SIZES = {ti.f32: 4, ti.f64: 8, ti.i32: 4}
 
 @dataclass(frozen=True)
 class SavedState:
-    """A state on the host, as a file can hold it.
+    """A state on the host that can be stored in a file.
 
     Attributes:
-        numbers: plain numbers, lists and dictionaries of them, by name; infinity occurs.
-        arrays: of the particles in the order of the device, the tables of the sort and the box of the grid, by name.
+        numbers: plain numbers, and lists and dictionaries of them, by name; values may be infinite.
+        arrays: arrays by name: particles in the order of the device, the tables of the sort, and the box of the grid.
     """
 
     numbers: dict[str, object]
     arrays: Mapping[str, np.ndarray]
 
     def copied(self) -> "SavedState":
-        """Return it with all arrays copied from the device, which outlives the next step."""
+        """Return the state with all arrays copied from the device, so that it stays valid after the next step."""
         return SavedState(self.numbers, dict(self.arrays))
 
 
 class ArraysOnDevice(Mapping[str, np.ndarray]):
-    """Arrays of a state that are copied one by one, as they are asked for, before the next step.
+    """Arrays of a state, copied from the device one by one when accessed; valid until the next step.
 
-    nbytes: of all of them.
+    Attributes:
+        nbytes: number of bytes of all arrays.
     """
 
     def __init__(self, fields: Mapping[str, ti.Field], others: Mapping[str, np.ndarray] = MappingProxyType({})) -> None:
-        """Name the arrays: those of fields, and others, which are on the host."""
+        """Store the named fields, and other named arrays on the host."""
         self._fields, self._others = fields, others
         entries = sum(math.prod(shape_of(field)) * SIZES[field.dtype] for field in fields.values())
         self.nbytes = entries + sum(array.nbytes for array in others.values())
@@ -56,23 +57,23 @@ class ArraysOnDevice(Mapping[str, np.ndarray]):
 
 
 def shape_of(field: ti.Field) -> tuple[int, ...]:
-    """Return the shape of a field as a numpy array."""
+    """Return the shape of a field as a NumPy array."""
     if isinstance(field, ti.lang.matrix.MatrixField):
         return (*field.shape, field.n) if field.m == 1 else (*field.shape, field.n, field.m)
     return tuple(field.shape)
 
 
-# The tiles of a sparse grid that have numbers; of the table of a sort what concerns these.
+# Names of the arrays of a sparse grid: its numbered tiles, and the table of the sort for these tiles.
 BLOCKS, START = "grid.blocks", "{}.block_start"
 
 
 def read_batch(batch: Batch) -> ArraysOnDevice:
-    """Return what a batch of one run has on the device and tells its kernel, by name, until the next launch."""
+    """Return the device arrays and kernel numbers of a batch of one run, by name, valid until the next launch."""
     return ArraysOnDevice(_fields(batch), {"numbers": batch.numbers[0], "counts": batch.counts[0]} | _blocks(batch))
 
 
 def write_batch(batch: Batch, arrays: Mapping[str, np.ndarray]) -> None:
-    """Replace what a batch of one run has by what was read of one of the same scene, or of one that ended earlier."""
+    """Replace the arrays of a batch of one run by those of a run of the same scene or one with an earlier end."""
     if batch.device.grid.sparse:
         _make_room(batch, arrays)
     fields = _fields(batch)
@@ -88,7 +89,7 @@ def write_batch(batch: Batch, arrays: Mapping[str, np.ndarray]) -> None:
     if batch.device.grid.sparse:
         _write_blocks(batch, arrays)
     for name, (row,) in (("numbers", batch.numbers), ("counts", batch.counts)):
-        # A run that goes on for longer has an end and a bound by colliders of its own.
+        # A continued run with a later end has its own end and its own bound by colliders.
         columns = batch.layout.of_scene(name)
         own = row[columns]
         row[:] = arrays[name]
@@ -98,7 +99,7 @@ def write_batch(batch: Batch, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 def _fields(batch: Batch) -> dict[str, ti.Field]:
-    """Return every field of the device that outlives a step, by name."""
+    """Return all fields of the device that persist between steps, by name."""
     device = batch.device
     found: dict[str, ti.Field] = {}
     if batch.backend.on_cpu:
@@ -125,27 +126,27 @@ def _fields(batch: Batch) -> dict[str, ti.Field]:
 
 
 def _blocks(batch: Batch) -> dict[str, np.ndarray]:
-    """Return what a sparse grid numbers, and the tables of its sorts, by name; nothing of a dense one."""
+    """Return the numbered tiles of a sparse grid and the tables of its sorts, by name; empty for a dense grid."""
     device, grid = batch.device, batch.device.grid
     if not grid.sparse:
         return {}
     found = {BLOCKS: grid.occupied()}
     for group, order in zip(device.groups, device.orders, strict=True):
         start = order.start.to_numpy()
-        # Behind the blocks in use all tiles are empty.
+        # All tiles after the blocks in use are empty.
         found[START.format(group.law.name)] = np.concatenate([start[: len(found[BLOCKS]) + 2], start[order.tiles :]])
     return found
 
 
 def _block_shapes(batch: Batch, arrays: Mapping[str, np.ndarray]) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of `_blocks`, as many as there are in `arrays`."""
+    """Return the shapes of the arrays of `_blocks` for the number of blocks in `arrays`."""
     count, order = len(arrays[BLOCKS]), batch.device.orders[0]
     starts = {START.format(group.law.name): (count + 3 + order.bins - order.tiles,) for group in batch.device.groups}
     return {BLOCKS: (count,)} | starts
 
 
 def _make_room(batch: Batch, arrays: Mapping[str, np.ndarray]) -> None:
-    """Let a sparse grid have room for saved blocks."""
+    """Enlarge a sparse grid if it has too few blocks for a saved state."""
     tiles, grid = arrays.get(BLOCKS, np.empty((0, 0))), batch.device.grid
     sound = tiles.ndim == 1 and (np.diff(tiles) > 0).all() and (tiles >= 0).all() and (tiles < grid.all_tiles).all()
     if not sound:
@@ -155,7 +156,7 @@ def _make_room(batch: Batch, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 def _write_blocks(batch: Batch, arrays: Mapping[str, np.ndarray]) -> None:
-    """Replace what `_blocks` returns."""
+    """Restore the arrays of `_blocks`."""
     batch.device.grid.occupy(arrays[BLOCKS])
     used = len(arrays[BLOCKS]) + 1
     for group, order in zip(batch.device.groups, batch.device.orders, strict=True):

@@ -1,18 +1,18 @@
-"""What a step is, and what a run does between two frames:
+"""The phases of a step, and the sequence of operations between two frames:
 
-    let the sheets of emitters enter that are due         emission
+    let due sheets of emitters enter                      emission
     sort the particles if they have drifted               particles.sort
     choose the step                                       step_size.StepSize.begin
     carry out its phases, see `step_phases`               cpu_phases.CpuPhases, gpu_launch.GpuPhases
-    count it: time, drift, bounds on the next one         step_size.StepSize.end
+    update time, drift and bounds on the next step        step_size.StepSize.end
     show the particles at an output time                  frames.reader
-    measure the state, where its bounds may have changed  step_size.StepControl
+    measure the state if its bounds may have changed      step_size.StepControl
 
-`cpu_launch.CpuLaunch.lead` does this inside one launch, until its host is needed; `gpu_launch.GpuLaunch.step` takes
-steps, and its host does the rest between launches. `run.Run` launches, and yields frames.
+`cpu_launch.CpuLaunch.lead` does this inside one launch until the host is needed. `gpu_launch.GpuLaunch.step` takes
+steps, and the host does the rest between launches. `run.Run` starts launches and yields frames.
 
-The body of a phase is a function of one node or particle, `Phase.body`, or the method of its name: of `CpuPhases`, for
-a part of the nodes or particles, and of `GpuPhases`, for one of them.
+The body of a phase is a function of one node or particle, `Phase.body`, or the method with the name of the phase: of
+`CpuPhases` for a part of the nodes or particles, and of `GpuPhases` for a single one.
 """
 
 from collections.abc import Callable, Sequence
@@ -27,21 +27,22 @@ from mpmcli.solver.transfer import redistribution as by
 
 @dataclass(frozen=True)
 class Phase:
-    """A loop of a step; the next one begins when it is done.
+    """A loop of a step; the next phase starts when it is finished.
 
-    Those that shift come before all others, in the steps that relax volumes.
+    Phases that shift particles precede all others, in steps that relax volumes.
 
     Attributes:
-        name: of its body.
-        over: what it runs over: the nodes in use, those on the planes of faces, their rows, the particles of a group,
-            all rows of nodes for each collider, threads that work at nodes, or runs, whose bodies move.
-        group: number of the group of particles.
-        adds: whether particles add to nodes. Without atomics pencils of one colour after another do.
-        turns: how often it runs, with `turn` counting up from 0.
-        body: of one node or particle, on any device, where the executors have no method of its name: body(at, node,
-            kick), or in a shift body(at, node or particle, time over which volumes relax); ranged: of a range of
-            particles on the CPU.
-        shifts: whether it shifts particles.
+        name: name of the phase and of its body.
+        over: the items of the loop: nodes in use ("nodes"), nodes on the planes of faces ("planes"), rows of nodes
+            ("rows"), the particles of a group ("particles"), rows of nodes per collider ("loads"), threads that process
+            nodes ("threads"), or runs with moving bodies ("bodies").
+        group: index of the group of particles.
+        adds: whether particles add to nodes; without atomics this is done colour by colour of pencils.
+        turns: number of repetitions, with `turn` counting from 0.
+        body: function of one node or particle on any device, for phases without a method: body(at, node, kick), or in a
+            shift body(at, node or particle, time over which volumes relax).
+        ranged: the same for a range of particles on the CPU.
+        shifts: whether the phase belongs to the shift of particles.
     """
 
     name: str
@@ -67,13 +68,21 @@ def step_phases(
     serial: bool = True,
     rigid: bool = False,
 ) -> tuple[Phase, ...]:
-    """Return the phases of a step; neighbours of one name that add nothing to nodes may be carried out at once.
+    """Return the phases of a step; consecutive ones with the same name that do not add to nodes may run concurrently.
 
-    uses_f_bar: whether the particles of each law share their change of volume; contact, friction: whether walls let go,
-    or rub; deterministic: whether P2G is in fixed point; loads: whether there are colliders, too; shifts: the
-    dimension where particles are shifted, else 0; separates: whether bodies meet by their surfaces; serial: whether
-    one thread lists what these show, on a CPU; rigid: whether colliders move freely. To meet them takes two turns a
-    round: over nodes, and over the bodies.
+    The phase "meet" takes two turns per round: over nodes, and over rigid bodies.
+
+    Args:
+        laws: the laws, one per group.
+        uses_f_bar: whether the particles of each law share their change of volume.
+        contact: whether any wall separates.
+        friction: whether any wall has friction.
+        deterministic: whether P2G is in fixed point.
+        loads: whether loads on colliders are summed in a phase of their own.
+        shifts: the dimension if particles are shifted, else 0.
+        separates: whether bodies are in contact by their surfaces.
+        serial: whether one thread lists surface particles, as on a CPU.
+        rigid: whether any collider moves freely.
     """
     groups = range(len(laws))
     return (
@@ -101,7 +110,7 @@ def step_phases(
 
 
 def shift_phases(laws: Sequence[Law], dimension: int, *, deterministic: bool) -> tuple[Phase, ...]:
-    """Return the phases that shift particles, of laws that have it."""
+    """Return the phases that shift the particles of laws with `Law.shifts`."""
     groups = range(len(laws))
     flowing = [g for g in groups if laws[g].shifts]
     phases = (
@@ -118,5 +127,5 @@ def shift_phases(laws: Sequence[Law], dimension: int, *, deterministic: bool) ->
 
 
 def sorted_fields(groups: Sequence) -> tuple[tuple[ti.Field, ...], ...]:
-    """Return the fields of each group that a sort moves with a particle."""
+    """Return the fields of each group that the sort moves."""
     return tuple((*group.state, *group.labels) for group in groups)

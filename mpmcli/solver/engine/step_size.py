@@ -1,8 +1,8 @@
 """The time step of a run (docs/theory.md, 6).
 
-`StepSize` chooses the next step, and counts what follows from the last one: kernels call it with the `RunState` of a
-run; so does the host, where a device has no double precision. `StepControl` measures the state of the particles where
-it is due, and the bounds that follow (6.7).
+`StepSize` chooses the next step and updates the run after a step. Kernels call it with the `RunState` of a run; so does
+the host if the device has no double precision. `StepControl` measures the state of the particles when due, and computes
+the bounds that follow (6.7).
 """
 
 import math
@@ -30,14 +30,14 @@ from mpmcli.stability.transfer_factors import INTERVAL, step_inertia
 COLLIDER, DEFORMING, FORCE, FORCED, MAXIMUM, CROSSING = (
     LIMITS.index(name) for name in ("collider", "deformation", "force", "forced", "maximum", "speed")
 )
-# A bound falls at once, and rises only to the smallest of the last HOLD to 2 HOLD steps, and only where that is RISE
-# times what it was: a step that follows the oscillation of a particle, always smaller in the same phase of it, drives
-# that oscillation. Lone particles of the neo-Hookean law let go at strains of 5 to 40 % gained up to 27 times their
-# energy in 10,000 steps where the bound rose by a thousandth per step, and up to 4 times here.
+# A bound falls immediately. It rises only to the smallest bound of the last HOLD to 2 HOLD steps, and only if that
+# exceeds it by the factor RISE. A step that follows the oscillation of a particle, always smaller in the same phase,
+# would amplify the oscillation. Lone neo-Hookean particles released at strains of 5 to 40 % gained up to 27 times their
+# energy in 10,000 steps when the bound rose by a thousandth per step, and up to 4 times with this rule.
 HOLD, RISE = 128, 1.05
-# Ratio of the stable step to the first one at which a run stops: steps that small do not recover.
+# Ratio of the stable step to the first one below which a run stops, because such small steps do not recover.
 COLLAPSE = 1e-4
-# Share of a step by which the time left to a target may exceed a whole number of steps.
+# Fraction of a step by which the time to a target may exceed an integer number of steps.
 SLACK = 1e-6
 INFINITE = math.inf
 
@@ -53,7 +53,7 @@ def as_real(number: ti.template()):
 
 @ti.pyfunc
 def nearer(value: ti.f64, limit: int, bound: ti.f64, code: int):
-    """Return the smaller one of a bound on the step and another one, and its code."""
+    """Return the smaller of two bounds on the step, and its code."""
     nearest, of_nearest = value, limit
     if bound < value or (bound == value and limit > code):
         nearest = bound
@@ -63,7 +63,7 @@ def nearer(value: ti.f64, limit: int, bound: ti.f64, code: int):
 
 @ti.data_oriented
 class StepSize:
-    """The steps of the runs of a batch."""
+    """Choice of the steps of the runs of a batch."""
 
     def __init__(
         self,
@@ -75,23 +75,23 @@ class StepSize:
         drifts: bool,
         shift: float = 0.0,
     ) -> None:
-        """Prepare; `drifts`: whether particles move on the grid; shift: cells by which some steps shift them."""
+        """Store constants; `drifts` is whether particles move on the grid, `shift` the largest shift, cells."""
         self.drifts, self.shift = drifts, shift
         self.values = values
         self.groups, self.bodies, self.scheme = tuple(groups), layout.bodies, scheme
 
     @classmethod
     def of(cls, device: Device, layout: Layout, values: DriveValues | HostValues) -> "StepSize":
-        """Return that of the runs of a batch, with what depends on time in `values`."""
+        """Return the `StepSize` of the runs of a batch; `values` provides time-dependent numbers."""
         drifts = device.particles.has_contact or not all(group.total for group in device.groups)
         shift = farthest_shift(device.grid.fine)
         return cls(layout, device.groups, values, device.grid.scheme, drifts=drifts, shift=shift)
 
     @ti.pyfunc
     def begin(self, run: ti.template()):
-        """Choose the next step, and return whether it can be taken.
+        """Choose the next step and return whether it can be taken.
 
-        It cannot where it has collapsed, or where the host must fill time tables.
+        It cannot if the stable step has collapsed or the host must fill time tables.
         """
         value, limit = self.stable_step(run)
         run.step_limit, run.deformation = limit, self.deformation_limit(run)
@@ -108,7 +108,7 @@ class StepSize:
         kick = ti.min(due, dt / run.safety)
         run.kick = kick
         since = run.velocity_time
-        # First: as long as the tables hold another time, the step means nothing.
+        # Checked first, because the step is meaningless while the tables cover another time.
         ends = since + kick
         if ti.static(len(self.values.motions) > 0):
             ends = ti.max(ends, run.time + dt)
@@ -129,7 +129,7 @@ class StepSize:
 
     @ti.pyfunc
     def relax(self, run: ti.template()):
-        """Count a step, and set the time over which it relaxes volumes."""
+        """Update the time since the last relaxation, and set the time over which this step relaxes volumes."""
         run.drift = run.drift + self.shift_ahead(run)
         run.relaxed = as_double(0.0)
         run.unrelaxed = run.unrelaxed + run.dt
@@ -142,7 +142,7 @@ class StepSize:
 
     @ti.pyfunc
     def shift_ahead(self, run: ti.template()):
-        """Return the cells by which the next step may shift particles before it scatters them."""
+        """Return the largest shift of particles before the scatter of the next step, cells."""
         cells = as_double(0.0)
         if run.unrelaxed_steps + 1 >= INTERVAL:
             cells = as_double(self.shift)
@@ -150,7 +150,7 @@ class StepSize:
 
     @ti.pyfunc
     def keep(self, run: ti.template()):
-        """Find the share of its motion that each body keeps in a step."""
+        """Compute the fraction of its motion that each body keeps in a step."""
         for g, group in ti.static(enumerate(self.groups)):
             slowest = as_double(INFINITE)
             if run.rate[g] > 0:
@@ -161,7 +161,7 @@ class StepSize:
 
     @ti.pyfunc
     def end(self, run: ti.template(), speed: ti.f64):
-        """Count a step with this largest speed of a node, m/s, -1 where a particle was lost. Its rates are stored."""
+        """Finish a step with this largest speed of a node, m/s, -1 if a particle was lost; rates are already stored."""
         dt = run.dt
         run.time = run.time + dt
         if run.steps_to_target == 1:
@@ -171,7 +171,7 @@ class StepSize:
         run.budget -= 1
         if speed >= 0:
             courant = dt * speed / run.spacing
-            # What waits for an emitter counts from the start.
+            # Particles waiting for an emitter count from the start.
             run.speed = ti.max(speed, run.slowest)
             run.courant = courant
             if ti.static(self.drifts):
@@ -188,7 +188,7 @@ class StepSize:
 
     @ti.pyfunc
     def stable_step(self, run: ti.template()):
-        """Return the step to take, s, safety included, and the code of the bound that sets it."""
+        """Return the next step, s, including the safety factor, and the code of the bound that determines it."""
         value, limit = self.nearest(run)
         value = run.safety * value
         if run.maximum < value:
@@ -222,10 +222,10 @@ class StepSize:
 
     @ti.pyfunc
     def speed_limit(self, run: ti.template(), value: ti.f64):
-        """Return the bound by the fastest particle, s, where the others allow a step `value`."""
+        """Return the bound by the fastest particle, s; the other bounds allow a step of `value`, s."""
         speed, pull = ti.max(run.speed, run.wall_speed), run.pull
         if ti.static(self.values.gravity_varies):
-            # The next kick ends in the middle of a step that is no longer than the other bounds allow.
+            # The next kick ends in the middle of a step, which is at most as long as the other bounds allow.
             ahead = ti.min(run.safety * value, run.end)
             pull += self.values.largest_gravity(run.w, run.velocity_time, run.time + ahead)
         bound = as_double(INFINITE)
@@ -236,13 +236,13 @@ class StepSize:
 
     @ti.pyfunc
     def next_frame(self, run: ti.template()):
-        """Go on to the output time of the frame `run.frame`, and begin to record steps for it."""
+        """Set the target to the time of the frame `run.frame`, and reset the statistics of steps."""
         run.target = run.end * as_double(run.frame) / as_double(run.frames)
         self.forget_steps(run)
 
     @ti.pyfunc
     def forget_steps(self, run: ti.template()):
-        """Begin to record steps for the ledger."""
+        """Reset the statistics of steps for the ledger."""
         run.smallest = as_double(INFINITE)
         run.largest = as_double(0.0)
         run.largest_courant = as_double(0.0)
@@ -251,7 +251,7 @@ class StepSize:
 
     @ti.pyfunc
     def limit_rise(self, run: ti.template(), bound: ti.f64):
-        """Let the bound that is held fall at once to a bound, and rise late, see HOLD."""
+        """Lower the held bound to a bound immediately, or raise it with a delay, see HOLD."""
         low, held = ti.min(run.low, bound), ti.min(run.held, bound)
         steps = run.held_steps + 1
         if steps >= HOLD:
@@ -265,7 +265,7 @@ class StepSize:
 
     @ti.pyfunc
     def watch(self, run: ti.template()):
-        """Count a step; return whether the host must measure."""
+        """Update the growth of stiffness after a step; return whether the host must measure the state."""
         due = False
         for g in ti.static(range(len(self.groups))):
             run.unwatched[g] += 1
@@ -280,7 +280,7 @@ class StepSize:
 
     @ti.pyfunc
     def record_step(self, run: ti.template()):
-        """Keep the smallest step with its bound, the largest one, and the largest Courant number, for the ledger."""
+        """Update, for the ledger, the smallest step and its bound, the largest step, and the largest Courant number."""
         dt, courant, limit = run.dt, run.courant, run.step_limit
         before = run.smallest_courant
         same = dt == run.smallest and (courant < before or (courant == before and limit < run.limit))
@@ -292,9 +292,9 @@ class StepSize:
         run.largest_courant = ti.max(run.largest_courant, courant)
 
 
-# Most steps between two measurements of the state, and with it of forces. A measurement is due earlier where a
-# stiffness may have grown since by more than this share of the margin that time.safety leaves; one that has fallen is
-# noticed late. The share is near 1 as every step reads the rate of deformation back.
+# Largest number of steps between two measurements of the state, without and with forces. A measurement is due earlier
+# if a stiffness may have grown by more than UNWATCHED_SHARE of the margin of time.safety; a decrease is noticed late.
+# The share is near 1 because every step reads back the rate of deformation.
 MOST_UNWATCHED_STEPS, MOST_PUSHED_STEPS, UNWATCHED_SHARE = 256, 64, 0.95
 
 
@@ -308,32 +308,32 @@ class StepControl:
     def __init__(
         self, scene: Scene, groups: Sequence, state: RunState, measurements: Sequence[Callable[[], StateBounds]]
     ) -> None:
-        """Take the first measurement of each group, see `RunGroup`; `measurements` return the last one."""
+        """Store the first measurement of each `RunGroup`; `measurements` return the last measurement of each."""
         self._groups, self._state = groups, state
         self._names = tuple(body.name for body in scene.sources)
         self._spacing = scene.domain.spacing
         self._inertia = step_inertia(scene.solver)
         self._measure = measurements
         state.longest = MOST_PUSHED_STEPS if scene.pushes else MOST_UNWATCHED_STEPS
-        # A step of safety times the limit is stable until the stiffness has grown to safety^-2 of what it was.
+        # A step of safety times the limit is stable until the stiffness has grown by the factor safety^-2.
         state.growth_allowed = -2 * UNWATCHED_SHARE * math.log(scene.time.safety)
         self.seconds = 0.0
         self._bounds = [measure() for measure in measurements]
-        # Per group, whether it has not been measured since the start.
+        # Per group, whether it was not yet measured after the start.
         self._at_start = [True] * len(groups)
         self._limits = [self._limits_of(g, bounds) for g, bounds in enumerate(self._bounds)]
 
     def begin(self) -> None:
-        """Write the bounds of time 0."""
+        """Write the bounds at time 0."""
         self._state.rate = [bounds.deformation_rate for bounds in self._bounds]
         self._write_limits()
 
     def save(self) -> dict[str, object]:
-        """Return what was measured of each group, as plain numbers, lists and dictionaries."""
+        """Return the last measurement of each group as plain numbers, lists and dictionaries."""
         return {"bounds": [asdict(bounds) for bounds in self._bounds], "at_start": list(self._at_start)}
 
     def load(self, saved: dict) -> None:
-        """Take what `save` returned; the numbers of the run are loaded on their own."""
+        """Restore the result of `save`; the numbers of the run are loaded separately."""
         self._at_start = list(saved["at_start"])
         for g, bounds in enumerate(saved["bounds"]):
             internal = {name: tuple(pair) for name, pair in bounds["bound"]["internal"].items()}
@@ -343,7 +343,7 @@ class StepControl:
 
     @property
     def speed(self) -> float:
-        """Largest speed as last measured, m/s."""
+        """Largest speed in the last measurement, m/s."""
         return max(bounds.speed for bounds in self._bounds)
 
     @property
@@ -352,11 +352,11 @@ class StepControl:
         return max(self._state.unwatched) == 0
 
     def limits(self) -> list[Limit]:
-        """Return every bound as last measured, and that of the rates of deformation in the last step."""
+        """Return all bounds from the last measurements, and the bound by the rates of deformation in the last step."""
         return [limit for limits in self._limits for limit in limits] + [_deformation_limit(self._state.rate)]
 
     def _own_limits(self) -> list[list[float]]:
-        """Return the step that each body of each group allows by its stiffness, and by the speed of its group, s."""
+        """Return the bound, s, of each body of each group by its stiffness and by the speed of its group."""
         return [
             [
                 min(
@@ -369,7 +369,7 @@ class StepControl:
         ]
 
     def limits_now(self) -> list[Limit]:
-        """Return every bound by the state as it is, without storing it."""
+        """Return all bounds from the current measurements without storing them."""
         states = [measure() for measure in self._measure]
         limits = [limit for g, bounds in enumerate(states) for limit in self._limits_of(g, bounds)]
         return [*limits, _deformation_limit(bounds.deformation_rate for bounds in states)]
@@ -380,9 +380,9 @@ class StepControl:
         return min(limit for limits in self._limits for limit in limits)
 
     def due(self) -> list[int]:
-        """Return the groups to measure now, after steps that a kernel has taken.
+        """Return the groups to measure after a series of steps by a kernel.
 
-        Groups that harden are measured after every such series: their bounds count as read back.
+        For groups that harden the measurement of the kernel after such a series is used instead, if it is sound.
         """
         began = time.perf_counter()
         state, due = self._state, []
@@ -399,11 +399,11 @@ class StepControl:
         return due
 
     def sound(self) -> bool:
-        """Return whether no particle is crushed, inverted or NaN, by a measurement that is not stored."""
+        """Return whether no particle is crushed, inverted or NaN; the measurement is not stored."""
         return all(_sound(measure()) for measure in self._measure)
 
     def measure(self, due: Iterable[int]) -> bool:
-        """Measure some groups, and return whether they are sound: none crushed, inverted or NaN."""
+        """Measure some groups and return whether no particle is crushed, inverted or NaN."""
         began = time.perf_counter()
         sound = True
         for g in due:
@@ -416,7 +416,7 @@ class StepControl:
         return sound
 
     def _take(self, g: int, bounds: StateBounds) -> None:
-        """Store the bounds of a group's state, and the limits that follow from them."""
+        """Store the bounds of the state of a group and the limits that follow from them."""
         self._bounds[g] = bounds
         self._at_start[g] = False
         self._state.rate[g] = bounds.deformation_rate
@@ -425,10 +425,10 @@ class StepControl:
         self._write_limits()
 
     def _limits_of(self, g: int, bounds: StateBounds) -> list[Limit]:
-        """Return the limits that the stiffness of the g-th group sets within these bounds of its state."""
+        """Return the limits by the stiffness of the g-th group within these bounds of its state."""
         group, bound = self._groups[g], bounds.bound
         if self._at_start[g]:
-            # What starts deformed springs back; later the bound is held through all phases of an oscillation.
+            # Initially deformed material springs back; later the bound is held through all phases of an oscillation.
             bound = group.law.rebound_bound(bound)
         limits = []
         for place, parameters in zip(group.bodies, group.law.members, strict=True):

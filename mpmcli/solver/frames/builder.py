@@ -1,4 +1,4 @@
-"""Builds frames and rows of the ledger from what a device has shown, and from sums over the particles of each law."""
+"""Builds frames and ledger rows from particle data of a device and from sums over the particles of each law."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -14,7 +14,7 @@ from mpmcli.solver.frames.columns import FrameArrays, FrameColumns, ParticleCons
 from mpmcli.solver.particles.sort import ACTIVE, BLOCKED, RETIRED, WAITING
 from mpmcli.stability.transfer_factors import affine_moment
 
-# Particles whose sums are formed at once, which bounds the memory.
+# Particles per batch of sums, which bounds the memory.
 ROWS = 65_536
 
 
@@ -23,10 +23,15 @@ class Sums:
     """Sums over the particles of a law at T times, in float64.
 
     Attributes:
-        mass: sum m, (T,); place: sum m x, (T, d); momentum: sum m v, (T, d).
-        motion: sum m v^2, (T,); affine: sum m |C|^2, (T,).
-        turning: sum m x cross v, and of the axial vector of C, `spin`: (T, 1) in 2D and (T, 3) in 3D.
-        elastic: stored energy, J, half a step earlier, (T,); speed_squared: the largest, (T,).
+        mass: sum m, (T,).
+        place: sum m x, (T, d).
+        momentum: sum m v, (T, d).
+        motion: sum m v^2, (T,).
+        affine: sum m |C|^2, (T,).
+        turning: sum m x cross v, (T, 1) in 2D and (T, 3) in 3D.
+        spin: sum of m times the axial vector of C, of the same shape.
+        elastic: stored energy, J, half a step earlier, (T,).
+        speed_squared: the largest squared speed, (T,).
     """
 
     mass: np.ndarray
@@ -42,7 +47,14 @@ class Sums:
 
 @dataclass(frozen=True)
 class StepsTaken:
-    """The steps between two frames: their number, size, s, and Courant number and bound of the smallest, and maxima."""
+    """The steps between two frames.
+
+    Attributes:
+        count: number of steps.
+        smallest: size, s, Courant number and bound of the smallest step.
+        largest: size of the largest step, s.
+        courant: the largest Courant number.
+    """
 
     count: int = 0
     smallest: tuple[float, float, str] = (0.0, 0.0, "")
@@ -59,10 +71,10 @@ def axis_pairs(dimension: int) -> tuple[tuple[int, int], ...]:
 
 
 def sums_of_rows(arrays: FrameArrays, constants: ParticleConstants, *, total: bool) -> list[Sums]:
-    """Return the sums over the particles of each law at one time, by the products sum m a a^T with a = (1, x, v, C).
+    """Return the sums over the particles of each law at one time, from sum m a a^T with a = (1, x, v, C).
 
-    On the CPU the kernel of a batch forms them (`reader.sum_range`). `arrays` has the columns "affine", and "gradient"
-    where bodies are `total`.
+    On the CPU the kernel of a batch computes them (`reader.sum_range`). `arrays` must have the columns "affine", and
+    "gradient" if bodies are `total`.
     """
     d, result = arrays.columns.dimension, []
     activity = arrays["activity"][0] if arrays.columns.first["activity"] >= 0 else None
@@ -76,7 +88,7 @@ def sums_of_rows(arrays: FrameArrays, constants: ParticleConstants, *, total: bo
             C = arrays["affine"][0, part].reshape(-1, d, d).astype(np.float64)
             spin = C
             if total:
-                # Nodes lie at F (X_i - X_p) from the particle, and move by C F (X_i - X_p).
+                # Nodes are at F (X_i - X_p) relative to the particle and have the relative velocity C F (X_i - X_p).
                 F = arrays["gradient"][0, part].reshape(-1, d, d).astype(np.float64)
                 C, spin = C @ F, C @ F @ F.transpose(0, 2, 1)
             spins += np.tensordot(mass, spin, 1)
@@ -105,13 +117,18 @@ def sums_of_rows(arrays: FrameArrays, constants: ParticleConstants, *, total: bo
 def ledger_sums(
     sums: Sequence[Sums], gravity: np.ndarray, spacing: float, dt: np.ndarray, moment: float = 0.25
 ) -> dict[str, np.ndarray]:
-    """Return the entries of `LedgerRow`s that belong to the state alone, by name, (T,) or (T, k).
+    """Return, by name, the entries of `LedgerRow`s that depend only on the state, (T,) or (T, k).
 
-    The affine velocity carries energy and angular momentum too (Jiang et al. 2017). All energies are taken half a step
-    back, where leapfrog has its velocities and their sum is second order in the step; with the positions as they are it
-    would swing by v dt/2 times the force.
+    The affine velocity contributes to energy and angular momentum (Jiang et al. 2017). All energies are evaluated half
+    a step back, at the time of the leapfrog velocities, where their sum is second order in the step; with the current
+    positions it would oscillate by v dt/2 times the force.
 
-    sums: of each law; gravity: m/s^2, (T, d); dt: the last step, s, (T,); moment: see `affine_moment`.
+    Args:
+        sums: sums of each law.
+        gravity: gravity, m/s^2, (T, d).
+        spacing: spacing of the grid, m.
+        dt: the last step, s, (T,).
+        moment: see `affine_moment`.
     """
     inertia = moment * spacing**2
     momentum, place = sum(one.momentum for one in sums), sum(one.place for one in sums)
@@ -127,7 +144,7 @@ def ledger_sums(
 
 
 def ledger_rows(sums: dict[str, np.ndarray], times: Sequence[float], taken: Sequence[StepsTaken]) -> list[LedgerRow]:
-    """Return a row for each time: the result of `ledger_sums`, and the steps to it."""
+    """Return a ledger row for each time, from the result of `ledger_sums` and the steps up to that time."""
     columns = {name: values.tolist() for name, values in sums.items()}
     for name in ("linear_momentum", "angular_momentum"):
         columns[name] = list(map(tuple, columns[name]))
@@ -148,28 +165,30 @@ def ledger_rows(sums: dict[str, np.ndarray], times: Sequence[float], taken: Sequ
     ]
 
 
-# Fewest cells inside the material that say anything: the edge of what is inside is sharp to a particle or so.
+# Smallest number of cells inside the material for an estimate, because its boundary is resolved only to about a
+# particle.
 FEWEST = 64
-# Cells that are looked at at once. Of a larger domain only those that particles occupy are.
+# Largest number of cells that are evaluated as a whole. In a larger domain only the bounding box of the particles is.
 WHOLE = 2**16
 
 
 class FilledCells:
-    """The cells that particles fill at T times; particles are added a part after another.
+    """The cells filled by particles at T times; particles are added in parts.
 
-    A cell is inside where it and all of its neighbours, corners included, hold particles of materials that flow and of
-    no others; beyond a wall there is nothing to ask for, beyond a periodic face is the other one.
+    A cell is inside if it and all of its neighbours, including corners, contain only particles of flowing materials,
+    and at least one. Neighbours beyond a wall impose no condition; beyond a periodic face they are the cells at the
+    opposite face.
     """
 
     def __init__(self, x: np.ndarray, spacing: float, cells: Sequence[int], periodic: Sequence[bool]) -> None:
-        """Choose the cells to look at from the places of all particles that may be added, (T, n, d), m."""
+        """Choose the cells from the positions of all particles that may be added, (T, n, d), m."""
         self._spacing, self._cells, self._periodic = spacing, tuple(cells), periodic
         self._low, self._high = [0] * len(cells), [n - 1 for n in cells]
         if math.prod(cells) > WHOLE:
             lower, upper = _bounds(x)
             for a in range(len(cells)):
                 self._low[a], self._high[a] = (max(0, int(self._cell(bound[a], a))) for bound in (lower, upper))
-        # One cell more on each side: a wall asks for nothing, the void is empty.
+        # One more cell on each side: it counts as inside beyond a wall, otherwise as empty.
         self._shape = [len(x)] + [last - first + 3 for first, last in zip(self._low, self._high, strict=True)]
         self._held = np.zeros(math.prod(self._shape))
         self._others: np.ndarray | None = None
@@ -178,7 +197,7 @@ class FilledCells:
         return np.minimum((x * (1 / self._spacing)).astype(np.intp), self._cells[a] - 1)
 
     def add(self, x: np.ndarray, volume: np.ndarray, flows: np.ndarray) -> None:
-        """Add particles, in whatever parts: x, (T, k, d), m, volume as it is, (T, k), and whether each flows, (k,)."""
+        """Add particles: x, (T, k, d), m, current volume, (T, k), and whether each flows, (k,)."""
         index = np.arange(len(x))[:, None]
         for a, (first, count) in enumerate(zip(self._low, self._shape[1:], strict=True)):
             index = index * count
@@ -191,7 +210,7 @@ class FilledCells:
         np.add.at(self._held, index.ravel(), volume.ravel())
 
     def errors(self) -> np.ndarray:
-        """Return the volume of the cells inside over that of the particles in them, less 1, (T,); 0 with few cells."""
+        """Return the volume of the inside cells divided by that of their particles, minus 1, (T,); 0 with few cells."""
         held = self._held.reshape(self._shape)
         inside = held > 0
         if self._others is not None:
@@ -201,7 +220,7 @@ class FilledCells:
             whole = self._low[axis] == 0, self._high[axis] == count - 1
             planes[0], planes[-1] = whole
             if self._periodic[axis]:
-                # Cells that are not looked at are empty.
+                # Cells outside the chosen range are empty.
                 planes[0], planes[-1] = (planes[-2], planes[1]) if all(whole) else (False, False)
         for axis in range(len(self._cells)):
             planes = inside.swapaxes(0, 1 + axis)
@@ -210,37 +229,40 @@ class FilledCells:
         within = held[(slice(None), *(slice(1, -1),) * len(self._cells))].reshape(len(held), -1)
         counts = np.count_nonzero(inside, axis=1)
         enough = counts >= FEWEST
-        # In one order, whatever the number of times.
+        # Summed in the same order for any number of times.
         filled = np.where(inside, within, 0.0).sum(axis=1)
         return np.where(enough, counts * self._spacing ** len(self._cells) / np.where(enough, filled, 1.0) - 1, 0.0)
 
 
 def _bounds(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the least and the largest coordinate along each axis, (d,), of places (T, n, d)."""
+    """Return the smallest and largest coordinate along each axis, (d,), of positions (T, n, d)."""
     found = [[(x[:, rows, a].min(), x[:, rows, a].max()) for a in range(x.shape[2])] for rows in parts_of(x.shape[1])]
     bounds = np.array(found, x.dtype)
     return bounds[:, :, 0].min(axis=0), bounds[:, :, 1].max(axis=0)
 
 
 def times_at_once(cells: Sequence[int]) -> int:
-    """Return how many times one `FilledCells` may look at: only one where it depends on the particles which cells."""
+    """Return how many times one `FilledCells` may cover: only one if its cells depend on the particles."""
     return max(1, WHOLE // math.prod(cells))
 
 
-# Largest rounding of a stored position, in cells.
+# Largest rounding error of a stored position, cells.
 POSITION_ERROR = 1e-3
 
 
 class Moment(NamedTuple):
-    """When a frame is, and what happened since the one before.
+    """The time of a frame, and the steps and loads since the previous frame.
 
     Attributes:
-        index: its number; time: s; step: steps so far; last_step: the last of them, s.
-        taken: the steps since the frame before.
-        loads: impulses, N s, and angular impulses, N m s, that each "collider", and of each pair in "contact" the first
-            body, took since then, (count, k), and `EXTREMES`; of each that is "rigid" its pose, relative to the lower
-            corner, and its rates, (count, k); each where there are any.
-        blocked: particles of emitters that found no room so far.
+        index: index of the frame.
+        time: time, s.
+        step: number of steps so far.
+        last_step: size of the last step, s.
+        taken: the steps since the previous frame.
+        loads: "collider": impulse, N s, and angular impulse, N m s, on each collider since the previous frame, (count,
+            k); "contact": the same on the first body of each pair; "rigid": pose relative to the lower corner and rates
+            of each rigid body, (count, k); and `EXTREMES`. Entries without objects are missing.
+        blocked: number of blocked particles of emitters so far.
     """
 
     index: int
@@ -253,12 +275,18 @@ class Moment(NamedTuple):
 
 
 class FrameBuilder:
-    """Builds the frames of a run, with the columns that they need; before: time of the last frame, s."""
+    """Builds the frames of a run.
+
+    Attributes:
+        constants: constant data of the particles.
+        columns: the columns that the frames need.
+        before: time of the previous frame, s.
+    """
 
     def __init__(
         self, scene: Scene, particles: Sequence[BodyParticles], groups: Sequence, columns: Sequence[str] = ()
     ) -> None:
-        """Keep what never changes of the `RunGroup`s; `columns` are further ones, by fields that need them."""
+        """Store the constants of the `RunGroup`s; `columns` are fields whose columns are needed in addition."""
         self._scene = scene
         self.constants = RunConstants(groups, [len(b.position) for b in particles])
         self._flows = any(group.law.flows for group in groups)
@@ -268,8 +296,8 @@ class FrameBuilder:
         self.columns = FrameColumns(scene.dimension, internal, shown, comes_and_goes=scene.comes_and_goes)
         self._waits = np.array([b.waits for b in particles])
         self._origin = np.array(scene.domain.origin)
-        # Far from zero single precision cannot tell neighbours apart, though the solver, which counts from the
-        # origin of the domain, can.
+        # Far from zero, single precision does not resolve neighbouring particles; the solver does, because its
+        # positions are relative to the origin of the domain.
         farthest = float(np.abs([self._origin, scene.domain.upper]).max())
         coarse = farthest * np.finfo(np.float32).eps > POSITION_ERROR * scene.domain.spacing
         self._position_type = np.float64 if coarse or groups[0].real == np.float64 else np.float32
@@ -282,7 +310,7 @@ class FrameBuilder:
     def build(
         self, moments: Sequence[Moment], arrays: FrameArrays, sums: Sequence[Sums]
     ) -> list[tuple[Frame, LedgerRow]]:
-        """Return frames with their rows, from the particles and the sums of each law at T moments."""
+        """Return frames and ledger rows from the particles and the sums of each law at T moments."""
         scene, constants = self._scene, self.constants
         (times, n), d = arrays.reals.shape[:2], scene.dimension
         position = np.empty((times, n, d), self._position_type)
@@ -343,7 +371,7 @@ class FrameBuilder:
                     conserved["kinetic"] = conserved["kinetic"] + body.kinetic(pose[:, j], motion[:, j])
                     conserved["potential"] = conserved["potential"] - body.mass * (middle[:, j] * gravity).sum(axis=1)
             else:
-                # Nothing acts before frame 0.
+                # There are no loads before frame 0.
                 spans = durations[:, None, None]
                 found = np.divide(found, spans, where=spans > 0, out=np.zeros_like(found))
                 conserved[f"{name}_force"], conserved[f"{name}_torque"] = found[..., :d], found[..., d:]
@@ -351,17 +379,17 @@ class FrameBuilder:
 
 
 class _Totals:
-    """Entries of the ledger over all particles at T times, which are added a part after another.
+    """Ledger entries over all particles at T times; particles are added in parts.
 
-    x: of all particles, (T, n, d), m; waits: whether the particles of each body belong to an emitter; flows: whether
-    any material does.
+    `x` are the positions of all particles, (T, n, d), m. `waits` is whether the particles of each body belong to an
+    emitter, `flows` whether any material flows.
     """
 
     def __init__(self, scene: Scene, x: np.ndarray, times: int, waits: np.ndarray, *, flows: bool) -> None:
         domain = scene.domain
         self._extent, self._waits = np.array(domain.size), waits
         self._low, self._high = np.full(times, np.inf), np.full(times, -np.inf)
-        # Particles of each body that have been let in, and that have left.
+        # Numbers of entered and of retired particles per body.
         self._entered, self._retired = (np.zeros((times, len(waits)), np.int64) for _ in range(2))
         self._comes_and_goes = scene.comes_and_goes
         at_once = 1 if scene.comes_and_goes else times_at_once(domain.cells)
@@ -389,7 +417,7 @@ class _Totals:
             active = state == ACTIVE
             self._low[t] = J[active].min(initial=self._low[t])
             self._high[t] = J[active].max(initial=self._high[t])
-            # Beyond an open face there are no cells to look at.
+            # There are no cells beyond an open face.
             seen = active & ((place >= 0) & (place <= self._extent)).all(axis=1)
             for _, filled in self._filled[t : t + 1]:
                 filled.add(place[None, seen], (J * constants.volume)[None, seen], constants.flows[seen])
@@ -400,8 +428,8 @@ class _Totals:
                 counts[t] += np.bincount(body[own], minlength=len(self._waits))
 
     def entries(self, masses: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the entries of `LedgerRow` by name, (T,); `masses` of a particle of each body, kg."""
-        # Where no particle takes part, none has changed its volume.
+        """Return the entries of `LedgerRow` by name, (T,); `masses` are the particle masses of each body, kg."""
+        # Without active particles the volume ratio is 1.
         none = self._low > self._high
         errors = [filled.errors() for _, filled in self._filled]
         found = {

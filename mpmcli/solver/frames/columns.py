@@ -1,4 +1,4 @@
-"""What the particles show at output times, row i being particle i, and the fields of frames made of it."""
+"""Particle data at output times, row i for particle i, and the fields of frames computed from them."""
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
@@ -10,40 +10,42 @@ from mpmcli.solver.particles.arrays import MASS, VOLUME
 
 # Fields that need the stress of every particle.
 STRESSES = ("stress", "pressure")
-# Particles of which arrays are computed at once, which bounds the memory and suits the cache.
+# Particles per batch of array operations, which bounds the memory and fits the cache.
 PART = 2**15
-# Rows and columns of the entries of a symmetric 3 x 3 matrix; 2D leaves out those that vanish.
+# Rows and columns of the entries of a symmetric 3 x 3 matrix; 2D omits the entries that vanish.
 ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))
 
 
 def stress_entries(dimension: int) -> tuple[tuple[int, int], ...]:
-    """Return row and column of each stored entry of tau."""
+    """Return the row and column of each stored entry of tau."""
     return ENTRIES if dimension == 3 else ENTRIES[:4]
 
 
 def parts_of(count: int) -> Iterator[slice]:
-    """Yield the rows of `count` particles, PART at a time."""
+    """Yield slices of the rows of `count` particles, PART at a time."""
     for first in range(0, count, PART):
         yield slice(first, min(first + PART, count))
 
 
 class FrameColumns:
-    """Columns of what particles show.
+    """Columns of particle data.
 
     In this order: x relative to the origin of the domain, m, and v, m/s, d each; the stored energy per volume at rest,
-    J/m^3, half a step earlier, where the velocities are; J or det F and the internal variables of the law after plastic
-    flow; and, where a field needs it, C, F after plastic flow, d^2 each, and tau, Pa, see `stress_entries`; and where
-    particles come and go their status, see `particles.sort`.
+    J/m^3, half a step earlier, at the time of the velocities; J or det F, and the internal variables of the law, after
+    plastic flow; if a field needs them, C and F after plastic flow, d^2 each, and tau, Pa, see `stress_entries`; and if
+    particles come and go, their status, see `particles.sort`.
 
     Attributes:
-        first: the first column of each, by name, -1 where it is left out; widths: number of columns of those there.
-        count: of all columns; dimension: d.
+        first: first column of each quantity by name, -1 if it is omitted.
+        widths: number of columns of each included quantity.
+        count: number of all columns.
+        dimension: d.
     """
 
     def __init__(
         self, dimension: int, internal: int, fields: Collection[str] = (), *, comes_and_goes: bool = False
     ) -> None:
-        """Assign columns; `internal` are the most internal variables of a law, `fields` those of the frames."""
+        """Assign columns, given the largest number of internal variables of a law and the fields of the frames."""
         d = dimension
         widths = {"x": d, "v": d, "energy": 1, "J": 1, "internal": internal}
         if "affine" in fields:
@@ -63,13 +65,13 @@ class FrameColumns:
 
 @dataclass(frozen=True)
 class FrameArrays:
-    """What n particles show at T times: the columns of `reals`, (T, n, k), which may have more of them."""
+    """Data of n particles at T times: the columns of `reals`, (T, n, k), which may have additional columns."""
 
     columns: FrameColumns
     reals: np.ndarray
 
     def __getitem__(self, name: str) -> np.ndarray:
-        """Return the columns of a name, a view of `reals`: (T, n) of energy, J and status, else (T, n, columns)."""
+        """Return the columns of a name as a view of `reals`: (T, n) for energy, J and status, else (T, n, columns)."""
         first = self.columns.first[name]
         if name in ("energy", "J", "activity"):
             return self.reals[..., first]
@@ -80,15 +82,16 @@ class FrameArrays:
 
 
 class RunConstants:
-    """What never changes of the particles of a run, n in all, row i being particle i.
+    """Constant data of the n particles of a run, row i for particle i.
 
-    body, material: (n,) int32, read-only, index into the scene's bodies and into the run's laws.
+    Attributes:
+        body, material: (n,) int32, read-only, indices into the bodies of the scene and the laws of the run.
     """
 
     def __init__(self, groups: Sequence, counts: Sequence[int]) -> None:
-        """Keep what each `RunGroup` has; `counts` are the particles of each body of the scene."""
+        """Store the constants of each `RunGroup`; `counts` are the numbers of particles of each body of the scene."""
         self._laws = [group.law for group in groups]
-        # Of each body: its law, and the mass and the volume of a particle.
+        # Per body: its law, and the mass and volume of a particle.
         self._law_of = np.zeros(len(counts), np.int32)
         self._table = np.zeros((len(counts), 2))
         for g, group in enumerate(groups):
@@ -100,7 +103,7 @@ class RunConstants:
         else:
             self.body = np.repeat(np.arange(len(counts), dtype=np.int32), counts)
             self.material = self._law_of[self.body]
-        # Every frame shares them.
+        # All frames share these arrays.
         for array in (self.body, self.material):
             array.flags.writeable = False
         self._all: ParticleConstants | None = None
@@ -130,9 +133,13 @@ class RunConstants:
 
 @dataclass(frozen=True)
 class ParticleConstants:
-    """What never changes of some particles of a run, (n,): mass, kg, volume at rest, m^3, whether the law `flows`.
+    """Constant data of some particles of a run, (n,).
 
-    members: of each law, itself and the rows of its particles.
+    Attributes:
+        mass: mass, kg.
+        volume: volume at rest, m^3.
+        flows: whether the law `flows`.
+        members: per law, the law and the rows of its particles.
     """
 
     mass: np.ndarray
@@ -141,7 +148,7 @@ class ParticleConstants:
     members: tuple[tuple[Law, slice | np.ndarray], ...]
 
     def volume_ratios(self, arrays: FrameArrays) -> np.ndarray:
-        """Return volume over volume at rest, (T, n)."""
+        """Return the ratio of volume to volume at rest, (T, n)."""
         J, internal = arrays["J"], arrays["internal"]
         if not any(law.internal for law, _ in self.members):
             return J
@@ -153,7 +160,7 @@ class ParticleConstants:
         return ratios
 
     def fields(self, arrays: FrameArrays, ratios: np.ndarray, names: Collection[str]) -> dict[str, np.ndarray]:
-        """Return fields of frames by name, (T, n) or (T, n, k), other than the velocity and the initial position."""
+        """Return fields of frames by name, (T, n) or (T, n, k), except the velocity and the initial position."""
         real = arrays.reals.dtype
         return {name: np.asarray(self._field(name, arrays, ratios), real) for name in names}
 
@@ -172,21 +179,21 @@ class ParticleConstants:
             case "stress":
                 return self._stress(arrays) / ratios[..., None]
             case "pressure":
-                # A sum along so short an axis takes five times as long.
+                # `sum` along such a short axis takes five times as long.
                 tau = arrays["tau"]
                 return (tau[..., 0] + tau[..., 1] + tau[..., 2]) / (-3 * ratios)
         return self._internal(name, arrays)
 
     def _stress(self, arrays: FrameArrays) -> np.ndarray:
         tau = np.zeros((*arrays.reals.shape[:2], 9), arrays.reals.dtype)
-        # The sign of a zero depends on how far a kernel was optimised.
+        # Adding 0 removes the sign of zeros, which depends on the optimisation of the kernel.
         entries = arrays["tau"] + 0.0
         for column, (i, j) in enumerate(stress_entries(arrays.columns.dimension)):
             tau[..., 3 * i + j] = tau[..., 3 * j + i] = entries[..., column]
         return tau
 
     def _internal(self, name: str, arrays: FrameArrays) -> np.ndarray:
-        """Return an internal variable; particles of other laws show it at rest."""
+        """Return an internal variable; for particles of other laws, its value at rest."""
         variables = [variable for law, _ in self.members for variable in law.internal if variable.name == name]
         values = np.full(arrays.reals.shape[:2], variables[-1].at_rest, arrays.reals.dtype)
         for law, rows in self.members:

@@ -1,4 +1,4 @@
-"""Stops a run whose state is not physical: which particle, where, what happened to it, which limit was nearest."""
+"""Stops a run with an unphysical state and reports the particle, its position, the cause and the nearest limit."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,12 +17,16 @@ from mpmcli.stability.limits import Limit
 
 @dataclass(frozen=True)
 class Snapshot:
-    """Host copies of one group's state, in the solver's order.
+    """Host copies of the state of one group, in solver order.
 
     Attributes:
-        x: (n, d) relative to the origin of the domain, m; v: (n, d); C: (n, d, d); deformation: (n) or (n, d, d).
-        internal: (n, k), the internal variables of the law; id, body: (n) int.
-        activity: (n) int, see `particles.sort`; None where all particles take part.
+        x: position relative to the origin of the domain, (n, d), m.
+        v: velocity, (n, d), m/s.
+        C: affine velocity, (n, d, d), 1/s.
+        deformation: J, (n), or F, (n, d, d).
+        internal: internal variables of the law, (n, k).
+        id, body: (n) int.
+        activity: (n) int, see `particles.sort`; None if all particles are always active.
     """
 
     group: object
@@ -37,7 +41,7 @@ class Snapshot:
 
     @cached_property
     def volume_ratio(self) -> np.ndarray:
-        """J of each particle as stored, (n,)."""
+        """Stored J of each particle, (n,)."""
         return self.deformation if self.deformation.ndim == 1 else determinant(self.deformation)
 
 
@@ -50,10 +54,15 @@ class Diagnosis:
     """Where and why a run stopped.
 
     Attributes:
-        step: number of the step after which it was seen; time: s.
-        particle: row of the particle in every frame; body: name of its body; position: last one inside the domain, m.
-        cause: what happened to it; suggestion: what may help.
-        limit: name of the bound on the step that was nearest; step_size: of that step, s.
+        step: number of the step after which the fault was detected.
+        time: time, s.
+        particle: row of the particle in every frame.
+        body: name of its body.
+        position: last position inside the domain, m.
+        cause: the fault of the particle.
+        suggestion: a change that may prevent it.
+        limit: name of the nearest bound on the step.
+        step_size: size of the step, s.
     """
 
     step: int
@@ -70,43 +79,43 @@ class Diagnosis:
         place = ", ".join(f"{x:.4g}" for x in self.position)
         return (
             f"the run became unstable at step {self.step}, t = {self.time:.6g} s: particle {self.particle} of body "
-            f'"{self.body}" at ({place}) m {self.cause}; the step was {self.step_size:.3g} s, its nearest limit '
+            f'"{self.body}" at ({place}) m {self.cause}; the step was {self.step_size:.3g} s, the nearest limit '
             f'"{self.limit}"; {self.suggestion}.'
         )
 
 
 class UnstableRunError(RunError):
-    """The state of a run is no longer physical; frames already written stay."""
+    """The state of a run is no longer physical; frames already written are kept."""
 
     def __init__(self, diagnosis: Diagnosis) -> None:
         super().__init__(diagnosis.sentence())
         self.diagnosis = diagnosis
 
 
-# Causes, and what may help.
+# Causes and suggestions.
 NOT_FINITE = "has a state that is not finite"
-INVERTED = "was turned inside out"
-CRUSHED = "was crushed to nothing"
+INVERTED = "was inverted"
+CRUSHED = "collapsed to zero volume"
 LEFT = "left the domain"
-OUTRAN = "outran the nodes prepared for it"
-FASTER = "got more momentum in a step than the sums of solver.deterministic have room for"
-DENSER = "lies where more mass meets than the sums of solver.deterministic have room for"
-STIFFER = "a stiffer material, a finer domain.spacing or a lower time.safety may keep it from that"
+OUTRAN = "moved beyond the nodes in use"
+FASTER = "received more momentum in one step than the sums of solver.deterministic can hold"
+DENSER = "is at a node with more mass than the sums of solver.deterministic can hold"
+STIFFER = "a stiffer material, a finer domain.spacing or a lower time.safety may prevent this"
 SUGGESTIONS = {
-    NOT_FINITE: "lower time.safety, or look for a number in the scene that is far from what you mean",
+    NOT_FINITE: "lower time.safety, or check the scene for a number of the wrong magnitude",
     INVERTED: STIFFER,
     CRUSHED: STIFFER,
     LEFT: "check the speeds and forces of the scene, or lower time.safety or time.step",
     FASTER: "check the speeds, forces and materials of the scene, or lower time.safety",
-    DENSER: "look for particles that lie on each other, or leave solver.deterministic out",
+    DENSER: "look for particles that coincide, or omit solver.deterministic",
     OUTRAN: "lower time.step, so that speeds are measured more often",
 }
-FORCED = 'time.step = "auto" would have taken steps that are stable'
+FORCED = 'time.step = "auto" takes stable steps'
 OTHERWISE = "check the speeds, forces and materials of the scene"
 
 
 def first_unsound(snapshot: Snapshot) -> int | None:
-    """Return the particle (in solver order) with the smallest id that is crushed, inverted or not finite, or None."""
+    """Return the crushed, inverted or non-finite particle (in solver order) with the smallest id, or None."""
     sound = snapshot.volume_ratio > SMALLEST_J
     for values in (snapshot.x, snapshot.v, snapshot.C):
         sound &= np.isfinite(values).reshape(len(sound), -1).all(1)
@@ -115,7 +124,7 @@ def first_unsound(snapshot: Snapshot) -> int | None:
 
 
 def first_beyond(snapshots: Sequence[Snapshot], particle: int | None, place: np.ndarray | None) -> tuple[Snapshot, int]:
-    """Return group and number, in solver order, of the particle with an id, or of the one nearest to a place, m."""
+    """Return the group and index, in solver order, of the particle with an id, or of the one nearest to `place`, m."""
     if particle is not None:
         found = [(snapshot, np.flatnonzero(snapshot.id == particle)) for snapshot in snapshots]
         return next((snapshot, int(rows[0])) for snapshot, rows in found if len(rows))
@@ -129,13 +138,13 @@ def first_beyond(snapshots: Sequence[Snapshot], particle: int | None, place: np.
 
 
 def rate_of_change(snapshot: Snapshot, spacing: float) -> np.ndarray:
-    """Return how fast each particle moves through cells or deforms, (n,), 1/s."""
+    """Return speed / spacing plus the sum of |C| of each particle, (n,), 1/s."""
     speed = np.linalg.norm(snapshot.v.astype(np.float64), axis=1)
     return speed / spacing + np.abs(snapshot.C.astype(np.float64)).sum((1, 2))
 
 
 def cause_of(snapshot: Snapshot, p: int, dt: float, domain: Domain) -> str:
-    """Return what happened to particle p (in solver order) in a step of dt (s) in a domain."""
+    """Return the fault of particle p (in solver order) in a step of dt, s."""
     values = (snapshot.x[p], snapshot.v[p], snapshot.C[p], snapshot.deformation[p])
     if not all(np.isfinite(value).all() for value in values):
         return NOT_FINITE
@@ -163,7 +172,7 @@ def diagnose(
     *,
     forced: bool,
 ) -> Diagnosis:
-    """Describe particle p (in solver order) of a group, which stopped the run for this cause."""
+    """Return the diagnosis for particle p (in solver order) of a group, which stopped the run with this cause."""
     advice = next((advice for start, advice in SUGGESTIONS.items() if cause.startswith(start)), OTHERWISE)
     return Diagnosis(
         step,
@@ -179,27 +188,27 @@ def diagnose(
 
 
 def stop(run: object, dt: float) -> NoReturn:
-    """Stop a `Run` at a lost particle; if none is known, at the first one that is not sound. `dt` is the step, s."""
+    """Stop a `Run` at a lost particle, or if none is recorded at the first unsound one; `dt` is the step, s."""
     for group, known in zip(run.groups, run.lost(), strict=True):
         snapshot = read_group(group)
         p = first_unsound(snapshot) if known is None else known
         if p is not None:
             _stop_at(run, snapshot, p, cause_of(snapshot, p, dt, run.scene.domain), dt)
-    raise AssertionError("a step reported a lost particle and kept no trace of it")
+    raise AssertionError("a step reported a lost particle, but none was found")
 
 
 def stop_collapsed(run: object, step: float) -> NoReturn:
-    """Stop a run at the particle that requires the smallest step, s: the one that moves or deforms fastest."""
+    """Stop a run at the fastest moving or deforming particle, which requires the smallest step, s."""
     snapshots = [read_group(group) for group in run.groups]
     rates = [rate_of_change(snapshot, run.spacing) for snapshot in snapshots]
     worst = max(range(len(snapshots)), key=lambda g: rates[g].max())
     first = run.state.first_stable_step
-    cause = f"allows a step of only {step:.3g} s, where the run began with {first:.3g} s"
+    cause = f"allows a step of only {step:.3g} s, compared with {first:.3g} s at the start of the run"
     _stop_at(run, snapshots[worst], int(rates[worst].argmax()), cause, step)
 
 
 def require_sums_hold(run: object) -> None:
-    """Stop a run where sums in fixed point had no room."""
+    """Stop a run if sums in fixed point were exceeded."""
     particle, node = run.grid.fixed.found_beyond(run.slot)
     if particle is not None or node is not None:
         place = None if node is None else (np.array(np.unravel_index(node, run.grid.shape)) - PAD) * run.spacing

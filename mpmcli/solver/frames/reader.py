@@ -1,4 +1,4 @@
-"""Reads a frame: what the particles show, and on the CPU the sums of the ledger."""
+"""Reads the particle columns of a frame, and on the CPU the sums of the ledger."""
 
 import numpy as np
 
@@ -23,15 +23,15 @@ from mpmcli.solver.transfer.lanes import (
 from mpmcli.solver.transfer.particle_update import SMALLEST_J
 from mpmcli.solver.transfer.volume import stretch_to
 
-# Entry of the sums that is 0 where a particle is crushed, inverted or not finite, else 1.
+# Index of the sum that is 0 if a particle is crushed, inverted or not finite, else 1.
 SOUND = 5
-# Columns of a frame that may be left out.
+# Optional columns of a frame.
 CHOSEN = ("affine", "gradient", "tau", "activity")
 
 
 @ti.func
 def deformed_on(law: ti.template(), stored: ti.template(), C: ti.template(), later: float):
-    """Return the deformation of a particle a time `later`, s, after it was stored."""
+    """Return the deformation of a particle at a time `later`, s, after the stored one."""
     state = stored
     if ti.static(law.deformation == "F"):
         state += later * (C @ stored)
@@ -59,13 +59,20 @@ def show_range(
     energies: ti.template(),
     offset: int,
 ):
-    """Write what some particles show, as `FrameColumns` has it, each to the row of its number after `row`.
+    """Write the `FrameColumns` of some particles, each to row `row` plus its id.
 
-    Rows are far from each other, as particles are sorted. So that sums need not look there, the energy, J/m^3, of
-    particle p goes to place `offset` + p of the field `energies`, too, if it is not None. The state does not change:
-    the next step applies the plastic flow that the frame shows.
+    The rows of neighbouring particles are far apart, because particles are sorted. The energy, J/m^3, of particle p is
+    therefore also stored in entry `offset` + p of the field `energies`, if it is not None, for the sums. The state does
+    not change: the next step applies the plastic flow that is already included in the frame.
 
-    dt: the last step, s; affine_at, gradient_at, tau_at, activity_at: columns, -1 where they are left out.
+    Args:
+        group: the group of particles.
+        first, count: first particle and number of particles.
+        dt: the last step, s.
+        row: row of the particle with id 0.
+        affine_at, gradient_at, tau_at, activity_at: first columns, -1 if omitted.
+        frame_buffer: the rows of the frame.
+        energies, offset: see above.
     """
     d = ti.static(group.dimension)
     keeps_F = ti.static(group.law.deformation == "F")
@@ -88,7 +95,7 @@ def show_range(
         if ti.static(group.uses_f_bar):
             for lane in range(own):
                 missing[lane] = group.to_mean[begin + lane]
-        # Half a step back, where the velocities are, and now: a loop, so that the law is compiled once.
+        # Half a step back, at the time of the velocities, and now; a loop, so that the law is compiled once.
         for k in range(turns):
             for lane in range(LANES):
                 C, inner = matrix_of(affine, 0, d, lane), vector_of(internal, 0, inners, lane)
@@ -135,7 +142,7 @@ def show_range(
                     for i, j in ti.static(ti.ndrange(d, d)):
                         frame_buffer[r, gradient_at + i * d + j] = found[2 + inners + i * d + j, lane]
                 else:
-                    # The isotropic F of this volume.
+                    # The isotropic F with this volume ratio.
                     stretch = found[1, lane] ** ti.static(1.0 / group.dimension)
                     for i, j in ti.static(ti.ndrange(d, d)):
                         frame_buffer[r, gradient_at + i * d + j] = stretch if ti.static(i == j) else 0.0
@@ -153,7 +160,7 @@ def sum_entries(dimension: int) -> int:
 
 @ti.func
 def sum_range(group: ti.template(), first: int, count: int, energies: ti.template(), offset: int):
-    """Return sums over some particles in one order, float64, see `sums_of`; `energies` are those of `show_range`."""
+    """Return float64 sums over some particles in fixed order, see `sums_of`; for `energies` see `show_range`."""
     d = ti.static(group.dimension)
     pairs = ti.static(axis_pairs(group.dimension))
     turns = ti.static(len(axis_pairs(group.dimension)))
@@ -170,7 +177,7 @@ def sum_range(group: ti.template(), first: int, count: int, energies: ti.templat
         total[0] += m
         total[1] += m * speed.norm_sqr()
         if ti.static(group.total):
-            # Nodes lie at F (X_i - X_p) from the particle, and move by C F (X_i - X_p).
+            # Nodes are at F (X_i - X_p) relative to the particle and have the relative velocity C F (X_i - X_p).
             F = ti.cast(group.stored(p), ti.f64)
             total[2] += m * (affine @ F).norm_sqr()
             affine = affine @ F @ F.transpose()
@@ -195,7 +202,7 @@ def sum_range(group: ti.template(), first: int, count: int, energies: ti.templat
 
 
 def sums_of(found: np.ndarray, dimension: int) -> tuple[Sums, np.ndarray]:
-    """Return the sums that `sum_range` has found at T times, (T, k), and whether all particles were sound, (T,)."""
+    """Return the `Sums` from results of `sum_range` at T times, (T, k), and whether all particles were sound, (T,)."""
     d = dimension
     turns = len(axis_pairs(d))
     mass, motion, affine, elastic, speed, sound = found.T[:6]
@@ -204,5 +211,5 @@ def sums_of(found: np.ndarray, dimension: int) -> tuple[Sums, np.ndarray]:
 
 
 def chosen_columns(columns: FrameColumns) -> tuple[int, ...]:
-    """Return the first column of each of CHOSEN, -1 where it is left out."""
+    """Return the first column of each of CHOSEN, -1 if it is omitted."""
     return tuple(columns.first[name] for name in CHOSEN)

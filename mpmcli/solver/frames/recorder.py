@@ -1,4 +1,4 @@
-"""Frames that the kernel of a batch records of one run while the run goes on, some in each launch."""
+"""Frames of one run that the kernel of a batch records during a launch."""
 
 from collections.abc import Callable, Mapping
 from types import SimpleNamespace
@@ -14,12 +14,12 @@ from mpmcli.solver.frames.builder import NO_STEPS, FrameBuilder, Moment, StepsTa
 from mpmcli.solver.frames.columns import FrameArrays, FrameColumns
 from mpmcli.solver.frames.reader import CHOSEN, chosen_columns, sum_entries, sums_of
 
-# Bytes that the frames of a run may take in one launch.
+# Largest number of bytes of the frames of a run in one launch.
 ROOM = 16_000_000
 
 
 def steps_of(run: RunState | SimpleNamespace, count: int) -> StepsTaken:
-    """Return the steps since the last frame, so many, as a kernel has recorded them."""
+    """Return the `count` steps since the last frame as recorded by a kernel."""
     smallest = run.smallest, run.smallest_courant, LIMITS[int(run.limit)]
     return StepsTaken(count, smallest, run.largest, run.largest_courant)
 
@@ -27,14 +27,16 @@ def steps_of(run: RunState | SimpleNamespace, count: int) -> StepsTaken:
 def moment_of(
     run: RunState | SimpleNamespace, index: int, taken: StepsTaken, loads: Mapping[str, np.ndarray]
 ) -> Moment:
-    """Return when a frame is, by the numbers of a run as they are, or as they were stored with the frame."""
+    """Return the moment of a frame, from the current numbers of a run or from those stored with the frame."""
     return Moment(index, run.time, int(run.step_count), run.last_step, taken, loads, int(run.blocked))
 
 
 class FrameRecorder:
-    """The place of a run in `Batch.frame_buffer` and `Batch.frame_stats`.
+    """Access to the frames of a run in `Batch.frame_buffer` and `Batch.frame_stats`.
 
-    index: the next frame to be read; steps: those of the run up to the last one.
+    Attributes:
+        index: index of the next frame to be read.
+        steps: number of steps of the run up to the last frame read.
     """
 
     def __init__(self, batch: Batch, slot: int, particles: int, frames: int) -> None:
@@ -45,19 +47,19 @@ class FrameRecorder:
         self.index = self.steps = 0
 
     def start(self, columns: FrameColumns) -> None:
-        """Let the kernel record frames from the next launch on."""
+        """Start recording frames with the next launch."""
         self._columns = columns
         size = self._particles * columns.count * self._batch.frame_buffer.itemsize
         self._capacity = min(max(1, ROOM // size), MOST_FRAMES, self._frames)
         self._state.records = 1
 
     def reserve(self) -> None:
-        """Let the next launch record as many frames as there is room for."""
+        """Let the next launch record as many frames as fit."""
         for name, value in self._reserved(self._capacity, self._columns).items():
             setattr(self._state, name, value)
 
     def _reserved(self, frames: int, columns: FrameColumns) -> dict[str, int]:
-        """Make room for frames in the next launch; return the counts that tell it so."""
+        """Allocate space for frames in the next launch; return the counts that it requires."""
         self._batch.reserve(frames * self._particles, columns.count)
         return {"frame_capacity": frames, **dict(zip(CHOSEN, chosen_columns(columns), strict=True))}
 
@@ -80,7 +82,7 @@ class FrameRecorder:
         return builder.build(moments, arrays, self._sums(count)[0])
 
     def read_now(self, arrays: FrameArrays, launch: Callable[..., None]) -> list[Sums] | None:
-        """Fill the rows of one frame with the state as it is; return the sums, None where a particle is not sound."""
+        """Fill the rows of one frame with the current state; return the sums, or None if a particle is not sound."""
         launch(records=1, arrived=1, frame=0, frames=0, **self._reserved(1, arrays.columns))
         sums, sound = self._sums(1)
         rows = self._batch.frame_buffer[self._batch.first_row(self._slot) :][: self._particles]
@@ -88,7 +90,7 @@ class FrameRecorder:
         return sums if sound else None
 
     def loads(self, count: int) -> dict[str, np.ndarray]:
-        """Return what was taken up to the first frames of the last launch, (count, ...), see `Moment.loads`."""
+        """Return the loads up to the first `count` frames of the last launch, (count, ...), see `Moment.loads`."""
         device, kind = self._batch.device, self._batch.kind
         first, found = len(FRAME_NUMBERS) + len(kind.members) * sum_entries(kind.dimension), {}
         rest = self._batch.frame_stats[self._slot, :count, first:].copy()
@@ -104,7 +106,7 @@ class FrameRecorder:
         return found if device.contact is None else found | dict(zip(EXTREMES, rest.T, strict=True))
 
     def _sums(self, count: int) -> tuple[list[Sums], bool]:
-        """Return the sums of each group at the first frames of the last launch, and whether all were sound."""
+        """Return the sums of each group at the first `count` frames of the last launch, and whether all were sound."""
         d = self._batch.kind.dimension
         groups = len(self._batch.kind.members)
         own = self._batch.frame_stats[self._slot, :count, len(FRAME_NUMBERS) :][:, : groups * sum_entries(d)].copy()

@@ -1,10 +1,10 @@
-"""P2G in fixed point, for `solver.deterministic` on a GPU: what it adds up, and how large that may become.
+"""P2G in fixed point, for `solver.deterministic` on a GPU: the sums and bounds on their size.
 
-A particle that moves, deforms and is pushed by less than FARTHEST cells in a stable step T adds at most its mass times
-FARTHEST h / T to the momentum of a node, which therefore has at most its own mass times that. A node has at most
-DENSEST times the mass that the densest body fills a cell with, or all of it (docs/theory.md, 8.4). Both are checked,
-the one for each particle before it is added, the other for each node; then no sum can overflow. Atomics add to
-integers in any order with the same result.
+A particle whose motion, deformation and acceleration displace it by less than FARTHEST cells in a stable step T adds at
+most its mass times FARTHEST h / T to the momentum of a node. The momentum of a node is therefore at most its mass times
+FARTHEST h / T. The mass of a node is at most DENSEST times the mass of a cell of the densest body, or the total mass if
+that is smaller (docs/theory.md, 8.4). The first bound is checked for each particle before it is added, the second for
+each node, so that no sum can overflow. Atomic additions of integers give the same result in any order.
 """
 
 import math
@@ -17,21 +17,24 @@ from mpmcli.quick_taichi import ti
 from mpmcli.solver.grid.grid import Grid
 from mpmcli.solver.particles.arrays import MASS, VOLUME, ParticleArrays
 
-# Backends whose devices all add 64-bit integers atomically. Elsewhere a sum is two integers of 32 bits.
+# Backends on which all devices have atomic addition of 64-bit integers. Elsewhere a sum is two 32-bit integers.
 WIDE = ("cpu", "cuda")
-# Bits of the largest sum: above it there is room for eight times as much, so that it can be seen that one is too large.
+# Bits of the largest permitted sum. Eight times as much fits, so that a sum that is too large can be detected.
 BITS_OF_WIDE, BITS_OF_HIGH = 60, 28
-# Bits that the lower of two integers adds: 2**17 numbers fit into it, whatever they are.
+# Bits of the lower of two integers per added number: any 2**17 numbers can be added without overflow.
 LOW_BITS = 15
-# Largest exponent of a scale, which single precision holds.
+# Largest exponent of a scale; it fits single precision.
 LARGEST_EXPONENT = 120
 
 
 @ti.data_oriented
 class FixedSums:
-    """Vectors of sums: what is added is scaled by a power of two before, so that no sum exceeds `largest`, and rounded.
+    """Vectors of integer sums: numbers are scaled by a power of two, so that sums stay below `largest`, and rounded.
 
-    width: numbers of a vector; wide: whether each is one 64-bit integer, otherwise two, the lower one of LOW_BITS.
+    Attributes:
+        width: numbers per vector.
+        wide: whether each sum is one 64-bit integer; otherwise it is two 32-bit integers, the lower one with LOW_BITS.
+        largest: the largest permitted scaled sum.
     """
 
     def __init__(self, width: int, count: int, *, wide: bool) -> None:
@@ -42,7 +45,7 @@ class FixedSums:
         self.low = None if wide else ti.Vector.field(width, ti.i32, shape=count)
 
     def scale(self, bound: float) -> float:
-        """Return the power of two that takes `bound`, and no less than its half, to `largest`."""
+        """Return the largest power of two that scales `bound` to at most `largest`."""
         exponent = math.floor(math.log2(self.largest / bound)) if bound > 0 else 0
         return 2.0 ** max(-LARGEST_EXPONENT, min(LARGEST_EXPONENT, exponent))
 
@@ -55,20 +58,20 @@ class FixedSums:
 
     @ti.func
     def add(self, place: int, share: ti.template()):
-        """Add scaled numbers, with atomics."""
+        """Add scaled numbers to the vector at `place`, with atomics."""
         for c in ti.static(range(self.width)):
             whole = ti.round(share[c])
             if ti.static(self.wide):
                 ti.atomic_add(self.high[place][c], ti.cast(whole, ti.i64))
             else:
-                # The difference is exact.
+                # This difference is exact.
                 rest = ti.round((share[c] - whole) * ti.static(2.0**LOW_BITS))
                 ti.atomic_add(self.high[place][c], ti.cast(whole, ti.i32))
                 ti.atomic_add(self.low[place][c], ti.cast(rest, ti.i32))
 
     @ti.func
     def value(self, place: int):
-        """Return a vector of scaled sums."""
+        """Return the scaled sums of the vector at `place`."""
         result = ti.Vector.zero(float, self.width)
         for c in ti.static(range(self.width)):
             result[c] = ti.cast(self.high[place][c], float)
@@ -78,31 +81,34 @@ class FixedSums:
 
 
 FARTHEST, DENSEST = 16.0, 32.0
-# Bound on the fine cells whose particles are around one fine node.
+# Bound on the sum of filled fractions at one fine node.
 CROWDED = 4096.0
-# Bound on |ln J| that counts, above that of the smallest J.
+# Bound to which ln J is clamped; it exceeds |ln J| of the smallest J.
 LARGEST_LOG = 16.0
 NOTHING = 2**31 - 1
-# Of a run: scales of masses, volumes, and sums over a cell, a bound on the mass of a node, kg, and what takes a stable
-# step, s, to the scale of momenta.
+# Indices into the scales of a run: scales of masses, of volumes, of volumes and of logarithms summed over a cell, a
+# bound on the mass of a node, kg, and the scale of momenta per second of the stable step.
 OF_MASS, OF_VOLUME, OF_CELL, OF_LOG, HEAVIEST, PER_STEP, SCALES = range(7)
 
 
 @ti.data_oriented
 class FixedPoint:
-    """The sums of a grid: nodes, filling, means, of its fields of that name, None where it has none.
+    """Sums of a grid: `nodes`, `filling` and `means` for its fields of the same name, None without such a field.
 
     Attributes:
-        parts: as of the grid.
-        fine: of the fraction of fine cells that particles fill, None where they are not shifted; of_fine: their scale.
-        reach: cells from the middle node of a stencil to its farthest one; run: that a view is for.
-        scales: of each run, see OF_MASS; pace: scale of momenta, its inverse, and the speed that has room.
-        beyond: of each run, the smallest id of a particle that is too fast for the sums, and the smallest index of a
-            node that is too heavy; NOTHING for none.
+        parts: `Grid.parts`.
+        fine: sums of the filled fraction of fine cells; None without shifts.
+        of_fine: scale of `fine`.
+        reach: cells from the middle node of a stencil to its farthest node.
+        run: number of the run of a view.
+        scales: scales of each run, see OF_MASS.
+        pace: scale of momenta of each run, its inverse, and the largest speed that fits the sums, m/s.
+        beyond: per run, the smallest id of a particle that is too fast for the sums, and the smallest index of a node
+            that is too heavy; NOTHING if there is none.
     """
 
     def __init__(self, grid: Grid, groups: Sequence[ParticleArrays], arch: str) -> None:
-        """Allocate, without a launch of a kernel: what is allocated after one is a buffer of its own."""
+        """Allocate without launching a kernel: fields allocated after a launch get a buffer of their own."""
         self.dimension = grid.dimension
         sums = partial(FixedSums, count=grid.runs * grid.node_count, wide=arch in WIDE)
         self.nodes = sums(grid.width)
@@ -120,12 +126,12 @@ class FixedPoint:
         self.beyond = ti.field(int, shape=2 * grid.runs)
 
     def write(self, run: int, groups: Sequence, spacing: float) -> None:
-        """Set the scales of a run with these particles, see `RunGroup`, on a grid of `spacing`, m."""
+        """Set the scales of a run with these particles (see `RunGroup`) on a grid with this spacing, m."""
         density = np.concatenate([group.rows[:, MASS] / group.rows[:, VOLUME] for group in groups]).astype(np.float64)
         total = sum(group.count * float(group.rows[:, MASS].max()) for group in groups)
         heaviest = min(total, DENSEST * float(density.max()) * spacing**self.dimension)
         volume = heaviest / float(density.min())
-        # A cell holds at most what the nodes of its stencils do.
+        # The volume in a cell is at most the sum over the nodes of a stencil.
         in_cell = volume * self.stencil**self.dimension
         of_mass, of_volume, of_cell, of_log = (
             self.nodes.scale(bound) for bound in (heaviest, volume, in_cell, LARGEST_LOG * in_cell)
@@ -136,12 +142,12 @@ class FixedPoint:
 
     @staticmethod
     def bytes_needed(numbers: int, averaged: int) -> int:
-        """Return the bytes of so many sums of a node, and of those of `averaged` groups that average volumes."""
+        """Return the bytes of `numbers` sums of a node and of the sums of `averaged` groups that average volumes."""
         return 8 * (numbers + 3 * averaged)
 
     @ti.func
     def set_step(self, run: int, step: float):
-        """Choose the scale of momenta, a power of two, for steps of which `step`, s, is stable."""
+        """Choose the scale of momenta, a power of two, for the stable step `step`, s."""
         whole = ti.cast(ti.min(self.scales[run][PER_STEP] * step, ti.static(2.0**LARGEST_EXPONENT)), ti.f32)
         exponent = (ti.bit_cast(whole, ti.i32) >> 23) - 127
         scale = ti.bit_cast((ti.max(exponent, -LARGEST_EXPONENT) + 127) << 23, ti.f32)
@@ -153,7 +159,7 @@ class FixedPoint:
             self.beyond[2 * run + k] = NOTHING
 
     def found_beyond(self, run: int) -> tuple[int | None, int | None]:
-        """Return the id of a particle and the index of a node that were too much for the sums, None where none was."""
+        """Return the id of a particle and the index of a node that exceeded the sums, or None."""
         particle, node = self.beyond.to_numpy()[2 * run : 2 * run + 2].tolist()
         return None if particle == NOTHING else particle, None if node == NOTHING else node - run * self._node_count
 
@@ -164,7 +170,7 @@ class FixedPoint:
 
     @ti.func
     def scaled(self, mass: float, middle: ti.template(), change: ti.template()):
-        """Scale what a particle adds to its stencil, see `momentum`, and return whether the sums have room for it."""
+        """Scale the contribution of a particle to its stencil (see `momentum`); return whether it fits the sums."""
         d = ti.static(self.dimension)
         scale, most = self.pace[self.run][0], mass * self.pace[self.run][2]
         fits = True
@@ -186,12 +192,12 @@ class FixedPoint:
 
     @ti.func
     def note(self, particle: int):
-        """Note that a particle is too fast for the sums."""
+        """Record that a particle is too fast for the sums."""
         ti.atomic_min(self.beyond[2 * self.run], particle)
 
     @ti.func
     def to_float(self, grid: ti.template(), node: int, relaxed: float):
-        """Set the fields of the grid at a node from the sums."""
+        """Convert the sums of a node to the fields of the grid."""
         d = ti.static(self.dimension)
         value, inverse = self.nodes.value(node), self.pace[self.run][1]
         if not (value[d] >= 0.0 and value[d] <= ti.static(self.nodes.largest)):
@@ -206,7 +212,7 @@ class FixedPoint:
 
     @ti.func
     def add_mean(self, g: ti.template(), cell: int, volume: float, log: float, growth: float):
-        """Add ln J of a particle of the g-th group, what it grew by, and 1, times its volume, m^3, to its cell."""
+        """Add ln J of a particle of the g-th group, its growth, and 1, times the volume, m^3, to its cell."""
         scales = self.scales[self.run]
         more = ti.Vector([log, growth, 1.0])
         for k in ti.static(range(2)):
@@ -216,7 +222,7 @@ class FixedPoint:
 
     @ti.func
     def mean(self, g: ti.template(), cell: int):
-        """Return what `Grid.means` holds."""
+        """Return the entry of `Grid.means` of the g-th group for a cell."""
         value = self.means[g].value(cell)
         for k in ti.static(range(2)):
             value[k] /= self.scales[self.run][OF_LOG]

@@ -1,4 +1,4 @@
-"""The background grid: nodes of mass and momentum, and the box of them that is in use."""
+"""The background grid: nodes with mass and momentum, and the box of nodes in use."""
 
 import math
 from collections.abc import Sequence
@@ -11,35 +11,35 @@ from mpmcli.quick_taichi import ti
 from mpmcli.solver.grid.period import Period
 from mpmcli.solver.transfer.splines import PAD, TransferScheme
 
-# What is left of the cells that a particle may drift, for the rounding of positions.
+# Margin of the drift of particles for the rounding of positions, cells.
 ROUNDING = 0.02
 
 
 def tile_edge(stencil: int, dimension: int, *, on_cpu: bool) -> int:
-    """Return the edge of a tile, cells, for a spline whose stencil has this many nodes per axis.
+    """Return the edge of a tile, cells, for a spline with `stencil` nodes per axis.
 
-    In larger tiles particles are sorted more rarely; in 3D the nodes must fit into the fastest cache.
+    Larger tiles require fewer sorts; in 3D the nodes of a tile must fit into the first-level cache.
     """
     return stencil + (3 if on_cpu and dimension == 2 else 1)
 
 
 def drift_allowed(tile: int, stencil: int) -> float:
-    """Return the cells that a particle may drift out of its tile as long as same-coloured tiles write disjoint nodes.
+    """Return how far, cells, particles may leave their tile while tiles of one colour write disjoint nodes.
 
-    Tiles of one colour lie two edges of t cells apart. With a drift of up to c cells one writes t + 2 c nodes and the
-    rest of the last stencil, which must be fewer: 2 c < t - stencil + 2.
+    Tiles of one colour are two edges of t cells apart. With a drift of up to c cells a tile writes to t + 2 c + stencil
+    - 1 nodes. These must be at most 2 t: 2 c < t - stencil + 2.
     """
     return (tile - stencil + 1) // 2 - ROUNDING
 
 
 def node_width(dimension: int, *, on_cpu: bool) -> int:
-    """Return the numbers per node: momentum and mass, and on the CPU padding to a vector register."""
+    """Return how many numbers a node stores: momentum and mass, padded to a vector register on the CPU."""
     return 4 if on_cpu else dimension + 1
 
 
 @ti.data_oriented
 class LinearNodes:
-    """Nodes of a box addressed by one linear index, with `strides` per axis; `first_node` is that of node 0."""
+    """Nodes of a box, addressed by one linear index with `strides` per axis; `first_node` is the index of node 0."""
 
     sparse, layers = False, 1
     dimension: int
@@ -47,7 +47,7 @@ class LinearNodes:
     first_node: int
 
     def line_node(self, plane: int, line: int) -> int:
-        """Return the linear offset of the first node of a line along the last axis in a plane of a stencil."""
+        """Return the linear offset of the first node of a line (along the last axis) in a plane of a stencil."""
         return line * self.strides[-2] + (plane * self.strides[0] if self.dimension == 3 else 0)
 
     @ti.func
@@ -59,39 +59,51 @@ class LinearNodes:
 
     @ti.func
     def stencil_at(self, base: ti.template()):
-        """Return what a walk over the stencil that begins at a node takes: its linear index."""
+        """Return the address of the stencil that begins at a node: its linear index."""
         return self.linear_index(base)
 
 
 @ti.data_oriented
 class Grid(LinearNodes):
-    """A dense grid of nodes over the domain and its ghost margin, addressed by one linear index.
+    """Dense grid of nodes over the domain and its ghost margin, addressed by one linear index.
 
-    Node index n along an axis lies at (n - PAD) h from the lower wall.
+    The node with index n along an axis is at the distance (n - PAD) h from the lower wall.
 
     Attributes:
-        spacing: h, m; inverse_spacing: 1/h; gradient_scale: h / D, the factor of a velocity gradient.
-        cells: of the domain per axis; scheme: constants of the transfers; period: axes along which the domain repeats.
-        tile: edge of a tile, cells; tiles: per axis; tile_count: of all of them.
-        shape: nodes per axis, margins included, a multiple of `tile`.
-        planes: of a stencil, normal to the first axis, 1 in 2D; runs: whose nodes it has, one after the other.
-        layers: of nodes of a run, one after the other, each with a velocity field; layer 0 where bodies share one.
-        width: numbers per node.
-        nodes: Vector(width) field: momentum and mass after P2G, velocity and mass after the update; from number `kept`
-            on the same of the shares that bodies keep, without stress and forces of this step, in schemes that do so.
-        parts: the first number of each of the two.
-        filling: Vector(kept) field: where the mass is in `nodes` it has the volume of particles at rest, m^3, in the
-            steps that relax volumes; None where the mass says as much. keeps_filling: whether it is there.
-        holding: `filling`, or else `nodes`.
-        means: Vector(3) field per group: of the particles in the cell behind a node the volume at rest times ln J, and
-            times what that grew by, and the volume at rest, m^3; None of groups that do not average them
-            (`transfer.volume`). kept_means: the others.
-        opens: (axis, side) of every face that material may leave through: nodes beyond it are like all others.
-        fixed: sums in fixed point, from which `FixedPoint.to_float` sets fields; None where P2G adds to these itself.
-            deterministic: whether there are such sums; then there are no `means`.
-        fine: the grid by which particles are shifted (`redistribution.FineGrid`), None where they are not.
-        box: (2, d) ints: first node in use and number of nodes in use, per axis. own: the same of a layer, whose rows
-            are those of the box; None where it has the box of all.
+        spacing: h, m.
+        inverse_spacing: 1/h, 1/m.
+        gradient_scale: h / D, the factor of a velocity gradient.
+        cells: cells of the domain per axis.
+        scheme: constants of the transfers.
+        period: the periodic axes.
+        tile: edge of a tile, cells.
+        tiles: number of tiles per axis.
+        tile_count: number of all tiles.
+        shape: nodes per axis, including margins, a multiple of `tile`.
+        planes: planes of a stencil normal to the first axis; 1 in 2D.
+        runs: number of runs, whose nodes are stored one after the other.
+        layers: layers of nodes per run, stored one after the other, each with a velocity field; 1 if all bodies share
+            one.
+        width: numbers per node in `nodes`.
+        nodes: Vector(width) field: momentum and mass after P2G, velocity and mass after the update. In schemes with
+            `keeps_flip_velocity`, the entries from `kept` on hold the same for the motion that bodies keep, without
+            stress and forces of this step.
+        parts: index of the first number of each of these parts.
+        filling: Vector(kept) field: the volume of particles at rest, m^3, in the entry of the mass in `nodes`, in steps
+            that relax volumes; None if it follows from the mass.
+        keeps_filling: whether `filling` is not None.
+        holding: `filling` if it is not None, otherwise `nodes`.
+        means: per group, a Vector(3) field: sums over the particles in the cell whose first node is this node, of the
+            volume at rest times ln J, the volume at rest times the growth of ln J, and the volume at rest, m^3; None
+            for groups that do not average volumes (`transfer.volume`).
+        kept_means: the entries of `means` that are not None.
+        opens: (axis, side) of every open face; nodes beyond it are ordinary nodes.
+        fixed: sums in fixed point, which `FixedPoint.to_float` converts to the fields; None if P2G adds to the fields
+            directly.
+        deterministic: whether `fixed` is not None; then all `means` are None.
+        fine: the fine grid for shifts of particles (`redistribution.FineGrid`); None without shifts.
+        box: (2, d) ints: first node in use and number of nodes in use, per axis.
+        own: the same for the nodes in use of a layer, within the rows of the box; None if the layer uses the whole box.
     """
 
     own = None
@@ -113,7 +125,7 @@ class Grid(LinearNodes):
         deterministic: bool,
         layers: int = 1,
     ) -> None:
-        """Allocate nodes for a number of runs; `uses_f_bar` is whether each group averages volumes over cells."""
+        """Allocate nodes for `runs` runs; `uses_f_bar` states for each group whether it averages volumes over cells."""
         self.dimension, self.kept = dimension, width
         self.parts = (0, width) if scheme.keeps_flip_velocity else (0,)
         self.width = width * len(self.parts)
@@ -142,29 +154,29 @@ class Grid(LinearNodes):
         self.box = ti.field(int, shape=(2 * runs, dimension))
 
     def in_layer(self, layer: object, own: object) -> "Grid":
-        """Return the view of a layer, by its number and what it has in use, variables of a kernel."""
+        """Return the view of a layer, given its number and its box in use, which are variables of a kernel."""
         view = copy(self)
         view.first_node, view.own = self.first_node + layer * self.node_count, own
         return view
 
     def within(self, box: object) -> "Grid":
-        """Return the view in which a smaller box is in use, a variable of a kernel."""
+        """Return a view with a smaller box in use, which is a variable of a kernel."""
         view = copy(self)
         view.box = box
         return view
 
     @property
     def narrow(self) -> bool:
-        """Whether a layer has less in use than the box; Taichi cannot compare with None."""
+        """Whether `own` is set; Taichi cannot compare with None."""
         return self.own is not None
 
     def stored_nodes(self) -> int:
-        """Return the number of nodes of a run that memory is allocated for."""
+        """Return the number of nodes allocated per run."""
         return math.prod(self.shape)
 
     @staticmethod
     def tile_counts(cells: Sequence[int], tile: int) -> tuple[int, ...]:
-        """Return the tiles per axis of a grid over these cells, for tiles with this edge."""
+        """Return the number of tiles per axis of a grid over these cells, for tiles with this edge."""
         return tuple(-(-(n + 1 + 2 * PAD) // tile) for n in cells)
 
     @staticmethod
@@ -184,7 +196,7 @@ class Grid(LinearNodes):
 
     @ti.func
     def part(self, index: int, first: ti.template()):
-        """Return what a node holds of one of `parts`."""
+        """Return the values of one of the `parts` of a node; `first` is the index of its first number."""
         if ti.static(len(self.parts) == 1):
             return self.nodes[index]
         else:
@@ -241,7 +253,7 @@ class Grid(LinearNodes):
 
     @ti.func
     def row_length(self, start: ti.template()):
-        """Return the number of nodes in use of a row, by the first of them."""
+        """Return the number of nodes in use of a row, given the first node of the row."""
         last = ti.static(self.dimension - 1)
         length = self.box[1, last]
         if ti.static(self.narrow):
@@ -266,13 +278,16 @@ class Grid(LinearNodes):
 
 @ti.func
 def box_of(grid: ti.template(), axis: ti.template(), low: int, high: int, drift: int, last_wall: int):
-    """Return the first and the last node in use along an axis, from those where stencils began at the last sort.
+    """Return the first and last node in use along an axis, from the range of first nodes of stencils at the last sort.
 
-    drift: cells that a particle may have moved since; last_wall: node of the upper wall.
+    Args:
+        low, high: smallest and largest first node of a stencil at the last sort.
+        drift: cells that a particle may have moved since.
+        last_wall: node of the upper wall.
     """
     first = low - drift
     last = high + drift + ti.static(grid.scheme.spline.nodes - 1)
-    # A box that comes near a wall holds the images beyond it too: they are read and written.
+    # A box near a wall includes the image nodes beyond it, because they are read and written.
     if ti.static(axis in grid.period.axes):
         if first <= PAD + PAD or last >= last_wall - PAD:
             first = 0

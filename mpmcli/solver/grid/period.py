@@ -1,8 +1,8 @@
-"""The axes along which a scene repeats: beyond one face lies what is as far inside of the other (docs/theory.md, 3.6).
+"""The periodic axes of a scene (docs/theory.md, 3.6).
 
-On the CPU particles are put back into the domain when they are sorted. Until then they, and what they scatter, go on
-beyond the face, so that pencils of one colour write disjoint nodes there as everywhere. On a GPU every step puts them
-back. Nodes beyond a face hold the sums of their images as soon as `MirrorImages` has folded them.
+On the CPU particles are wrapped into the domain when they are sorted. Until then they continue, and scatter, beyond the
+face, so that pencils of one colour write disjoint nodes there too. On a GPU every step wraps them. Nodes beyond a face
+hold the sums of their images after `MirrorImages` has folded them.
 """
 
 from collections.abc import Sequence
@@ -16,9 +16,9 @@ from mpmcli.solver.transfer.splines import PAD
 
 @ti.func
 def opaque(x: float):
-    """Return a number of single precision that is not negative, as no compiler can tell.
+    """Return a non-negative single-precision number unchanged, in a form that compilers cannot simplify.
 
-    Those of Vulkan and Metal reorder sums, and would find that a rounded sum less its first term is the second.
+    The compilers of Vulkan and Metal reorder sums and would replace a rounded sum minus its first term by the second.
     """
     return ti.bit_cast(ti.max(ti.bit_cast(x, ti.i32), 0), ti.f32)
 
@@ -31,9 +31,14 @@ def opaque_signed(x: float):
 
 @ti.data_oriented
 class Period:
-    """The periodic axes of all runs, and of each run the extent of the domain, m, and its cells.
+    """The periodic axes of all runs, and the extent of the domain of each run.
 
-    at_once: whether every step puts particles back into the domain; run: number of the run that a view is for.
+    Attributes:
+        axes: the periodic axes.
+        at_once: whether every step wraps particles into the domain.
+        run: number of the run of a view.
+        extent: size of the domain per run and axis, m.
+        cells: cells of the domain per run and axis.
     """
 
     def __init__(self, faces: Sequence[tuple[str, str]], runs: int = 1, *, at_once: bool) -> None:
@@ -57,7 +62,7 @@ class Period:
 
     @ti.func
     def inside(self, x: ti.template()):
-        """Return where the image of a point lies that is inside the domain, m."""
+        """Return the image of a point that is inside the domain, m."""
         result = x
         for a in ti.static(self.axes):
             extent = self.extent[self.run][a]
@@ -69,7 +74,7 @@ class Period:
 
     @ti.func
     def wrap(self, group: ti.template(), p: int):
-        """Put particle p back into the domain; its remainder takes what rounding would lose (docs/theory.md, 8.3)."""
+        """Wrap particle p into the domain; its remainder takes the rounding error (docs/theory.md, 8.3)."""
         for a in ti.static(self.axes):
             after, lost = self.wrapped(group, group.x[p][a], a)
             group.x[p][a] = after
@@ -78,7 +83,7 @@ class Period:
 
     @ti.func
     def wrapped(self, group: ti.template(), x: float, axis: ti.template()):
-        """Return a coordinate inside the domain, and what rounding took from it, m: beyond the upper face nothing."""
+        """Return a coordinate inside the domain and its rounding error, m, 0 for a point beyond the upper face."""
         extent = self.extent[self.run][axis]
         after, lost = x, 0.0
         if x < 0.0:
@@ -91,9 +96,10 @@ class Period:
 
     @ti.func
     def moved(self, group: ti.template(), x: float, way: float, extent: float, axis: ti.template()):
-        """Return where a particle at x moves by `way`, m, what rounding took, and 1 where it is lost, else 0.
+        """Return the new coordinate of a particle moved by `way`, its rounding error, m, and 1 if it is lost, else 0.
 
-        A sort is due long before it has gone half of the domain.
+        Without `at_once` it is lost if it is more than half of the domain beyond a face; a sort is due long before
+        that.
         """
         after, lost = x + way, 0.0
         if ti.static(group.carries):
@@ -104,7 +110,7 @@ class Period:
             after = inside
             lost += taken
             low = 0.0
-        # Written so that a NaN is out.
+        # Written so that a NaN is lost.
         out = 1.0
         if after >= low and after <= extent - low:
             out = 0.0
@@ -112,9 +118,9 @@ class Period:
 
     @ti.func
     def image(self, node: ti.template(), images: int):
-        """Return the image of a node, or of a cell, along the axes of a bit set, and whether there is one on the grid.
+        """Return the image of a node, or of a cell, along the axes of a bit set, and whether it is on the grid.
 
-        Along a periodic axis there is one at most: the domain is longer than both margins.
+        Along a periodic axis there is at most one image, because the domain is longer than both margins.
         """
         place, exists = node, True
         for a in ti.static(range(self.dimension)):

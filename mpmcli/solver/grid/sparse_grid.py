@@ -1,7 +1,8 @@
-"""A grid whose nodes are there where particles are alone: blocks of nodes, one for each tile that particles reach.
+"""A sparse grid: blocks of nodes, one for each tile that particles reach.
 
-A sort numbers the tiles that particles reach until the next one, in their order. Nodes are stored tile by tile in that
-order, and a table has the number of every tile of the domain. Number 0 stands for all others: its nodes are zero.
+A sort numbers, in order of their linear index, the tiles that particles can reach until the next sort. Nodes are stored
+tile by tile in this order, and a table maps every tile of the domain to its number. All other tiles have number 0,
+whose nodes are zero.
 """
 
 import math
@@ -26,11 +27,13 @@ from mpmcli.solver.transfer.splines import PAD, SPLINES
 
 @ti.data_oriented
 class BlockNodes(LinearNodes):
-    """Nodes that are stored tile by tile.
+    """Nodes stored tile by tile.
 
     Attributes:
-        tile: edge of a tile, nodes; tiles: per axis; block: nodes of a tile.
-        table: (tiles of the domain) int, their numbers.
+        tile: edge of a tile, nodes.
+        tiles: number of tiles per axis.
+        block: nodes per tile.
+        table: (tiles of the domain) int, the number of each tile.
     """
 
     sparse = True
@@ -45,7 +48,7 @@ class BlockNodes(LinearNodes):
 
     @ti.func
     def tile_index(self, node: ti.template()):
-        """Return the linear index of the tile that holds the node at these integer coordinates."""
+        """Return the linear index of the tile that contains the node with these integer coordinates."""
         index = 0
         for a in ti.static(range(self.dimension)):
             index = index * ti.static(self.tiles[a]) + ti.raw_div(node[a], ti.static(self.tile))
@@ -60,7 +63,7 @@ class BlockNodes(LinearNodes):
 
     @ti.func
     def stencil_at(self, base: ti.template()):
-        """Return what each node adds, along each axis, to the index of its tile, and then to that in the tile."""
+        """Return per stencil node and axis the contributions to the tile index and to the index within the tile."""
         nodes, d = ti.static((self.scheme.spline.nodes, self.dimension))
         offsets = ti.Matrix.zero(int, nodes, ti.static(2 * d))
         for k, a in ti.static(ti.ndrange(nodes, d)):
@@ -82,11 +85,16 @@ class BlockNodes(LinearNodes):
 
 @ti.data_oriented
 class TileWindow(LinearNodes):
-    """Copies, one for each thread, of the nodes that the stencils of a tile's particles reach.
+    """Copies, one per thread, of the nodes that the stencils of the particles of a tile reach.
 
-    A stencil is in up to 2^d blocks, but in one window, whose nodes have linear indices as a dense grid's. So P2G and
-    G2P are the same on both; see `Grid` for the attributes that they share. size: nodes of a window; before_tile,
-    behind_tile: of them, those before the tile and behind it, per axis.
+    A stencil extends over up to 2^d blocks, but lies in a single window, whose nodes have linear indices as in a dense
+    grid. P2G and G2P are therefore the same code on both grids. See `Grid` for the attributes not listed here.
+
+    Attributes:
+        size: nodes per window.
+        before_tile, behind_tile: nodes of a window before and behind the tile, along each axis.
+        summed: pairs of a field of the window and the field of the grid that P2G adds to in every step.
+        relaxing: such pairs for the steps that relax volumes.
     """
 
     runs = 1
@@ -105,12 +113,11 @@ class TileWindow(LinearNodes):
             None if field is None else ti.Vector.field(field.n, float, shape=self.node_count)
             for field in (grid.nodes, grid.filling)
         )
-        # What P2G adds to, with the fields of the grid: in every step, and in those that relax volumes.
         self.summed = ((self.nodes, grid.nodes),)
         self.relaxing = () if grid.filling is None else ((self.filling, grid.filling),)
 
     def seen_from(self, grid: Grid, first_node: object) -> "TileWindow":
-        """Return the window of a view of the grid, with a linear index of node 0, a variable of the kernel."""
+        """Return the window for a view of the grid; the linear index of node 0 is a variable of the kernel."""
         result = copy(self)
         result.first_node = first_node
         for name in ("spacing", "inverse_spacing", "gradient_scale"):
@@ -119,7 +126,7 @@ class TileWindow(LinearNodes):
 
     @ti.func
     def first_of(self, t: int, place: ti.template()):
-        """Return the linear index that node 0 of the grid would have, in the window of thread t at a tile."""
+        """Return the linear index that node 0 of the grid would have in the window of thread t at a tile."""
         first = t * ti.static(self.size)
         for a in ti.static(range(self.dimension)):
             first -= (place[a] * ti.static(self.tile) - self.before_tile) * ti.static(self.strides[a])
@@ -127,7 +134,7 @@ class TileWindow(LinearNodes):
 
     @ti.func
     def clear(self, t: int, relaxed: float):
-        """Set what P2G adds to in the window to zero, volumes where they are relaxed."""
+        """Set the fields that P2G adds to to zero in the window of thread t, volumes only if they are relaxed."""
         for field, _ in ti.static(self.summed):
             self.zero(field, t)
         for field, _ in ti.static(self.relaxing):
@@ -147,7 +154,7 @@ class TileWindow(LinearNodes):
 
     @ti.func
     def add(self, grid: ti.template(), t: int, place: ti.template(), relaxed: float):
-        """Add the window to the nodes near a tile, volumes where they are relaxed."""
+        """Add the window to the nodes near a tile, volumes only if they are relaxed."""
         for pair in ti.static(self.summed):
             self.exchange(pair, grid, t, place, False)
         for pair in ti.static(self.relaxing):
@@ -156,7 +163,7 @@ class TileWindow(LinearNodes):
 
     @ti.func
     def exchange(self, pair: ti.template(), grid: ti.template(), t: int, place: ti.template(), loads: ti.template()):
-        """Go through the nodes near a tile, block by block."""
+        """Copy the nodes near a tile to the window if `loads`, otherwise add the window to them; block by block."""
         d, field, of_grid = ti.static((self.dimension, pair[0], pair[1]))
         for q in range(ti.static(3**d)):
             tile, exists = 0, True
@@ -193,48 +200,49 @@ class TileWindow(LinearNodes):
                             of_grid[n + c] = of_grid[n + c] + field[k + c]
 
 
-# Particles for each of which there is room for a block, and blocks beside those.
+# Number of particles per block allocated at first, and number of additional blocks.
 SHARED_BY, AT_LEAST = 20, 500
-# What a table has for tiles that are to be numbered: they hold particles, or are reached by some.
+# Entries of the table for tiles to be numbered: tiles that hold particles, and tiles that particles reach.
 HOLDS, REACHED = -1, -2
-# Places in `sizes`: blocks in use, pencils, blocks that a sort asked for, and of each colour the pencils.
+# Indices into `sizes`: blocks in use, pencils, blocks required by the last sort, and pencils of each colour.
 BLOCKS, PENCILS, WANTED, COLOURS = range(4)
 
 
 def room_for_blocks(particles: int) -> int:
-    """Return the number of blocks that memory is allocated for at first."""
+    """Return the number of blocks allocated at first."""
     return particles // SHARED_BY + AT_LEAST
 
 
 def most_blocks(grid: "SparseGrid") -> int:
-    """Return the number of blocks that a larger grid may have in what memory is free, and indices reach."""
+    """Return the largest number of blocks of a larger grid, limited by free memory and 32-bit indices."""
     fine, free = grid.fine.in_cell if grid.fine else 0, psutil.virtual_memory().available
     numbers = grid.width + grid.kept * grid.keeps_filling + 3 * len(grid.kept_means) + fine
-    # And of the tables of a sort on some threads.
+    # Bytes of a block, including the tables of a sort on some threads.
     block = (4 if grid.nodes.dtype == ti.f32 else 8) * numbers * grid.block + 4 * 16
     return int(min(MEMORY_SHARE * free // block, LARGEST_INDEX // (grid.block * max(fine, 1))))
 
 
 @ti.data_oriented
 class SparseGrid(BlockNodes, Grid):
-    """See `Grid` and `BlockNodes`; of one run, on the CPU.
+    """Sparse grid of one run on the CPU; see `Grid` and `BlockNodes`.
 
     Attributes:
-        tile_count: blocks that there is room for, number 0 included.
-        tile_at: (tile_count) int, the tile of each number; sizes: see BLOCKS.
-        pencils: (tile_count + 1) int, the first block of each pencil; coloured: (colours, tile_count) int, the numbers
-            of the pencils of each colour.
-        window: of the nodes near a tile, for each thread.
+        tile_count: number of allocated blocks, including number 0.
+        tile_at: (tile_count) int, the tile of each number.
+        sizes: counts, see BLOCKS.
+        pencils: (tile_count + 1) int, the first block of each pencil.
+        coloured: (colours, tile_count) int, the numbers of the pencils of each colour.
+        window: windows on the nodes near a tile, one per thread.
     """
 
     def __init__(self, *args: object, blocks: int, threads: int, **options: object) -> None:
-        """Allocate; `blocks` is the room for blocks, and the rest that of `Grid`."""
+        """Allocate `blocks` blocks; the other arguments are those of `Grid`."""
         self._blocks = blocks
         super().__init__(*args, **options)
         self.all_tiles = math.prod(self.tiles)
         self.tile_count = blocks
         self.block = self.tile**self.dimension
-        # Nodes that stencils of particles reach before their tile and behind it.
+        # Numbers of nodes that stencils of particles reach before and behind their tile.
         drift = math.ceil(drift_allowed(self.tile, self.scheme.spline.nodes))
         self.beyond = drift, drift + self.scheme.spline.nodes - 1
         repeats = [axis in self.period.axes for axis in range(self.dimension)]
@@ -263,11 +271,11 @@ class SparseGrid(BlockNodes, Grid):
 
     @staticmethod
     def table_bytes(tiles: int, blocks: int, dimension: int) -> int:
-        """Return the bytes of the tables, for so many tiles of the domain."""
+        """Return the bytes of the tables for this number of tiles of the domain and of blocks."""
         return 4 * tiles + tiles // SPAN + 4 * blocks * (2 + 2 ** (dimension - 1))
 
     def occupy(self, tiles: np.ndarray) -> None:
-        """Number these tiles, sorted linear indices, and no others."""
+        """Number only these tiles, given by sorted linear indices."""
         self._occupy(np.ascontiguousarray(tiles, np.int32))
 
     @ti.kernel
@@ -313,7 +321,7 @@ class SparseGrid(BlockNodes, Grid):
 
     @ti.func
     def row_count(self):
-        """Return the number of rows of nodes in the blocks in use, number 0 left out."""
+        """Return the number of rows of nodes in the blocks in use, without number 0."""
         return (self.sizes[BLOCKS] - 1) * ti.static(self.block // self.tile)
 
     @ti.func
@@ -331,19 +339,19 @@ class SparseGrid(BlockNodes, Grid):
 
     @ti.func
     def mark(self, order: ti.template(), begin: int, end: int):
-        """Mark the tiles of particles `begin` to `end` - 1 that take part."""
+        """Wrap particles `begin` to `end` - 1 into the domain and mark the tiles of active ones."""
         for p in range(begin, end):
             order.wrap(p)
             if order.status_of(p) == ACTIVE:
                 tile = self.tile_index(order.first_node_of(p))
-                # Other threads may write the same.
+                # Other threads may write the same value.
                 if self.table[tile] != HOLDS:
                     self.table[tile] = HOLDS
                     self._marked[tile // SPAN] = ti.cast(1, ti.i8)
 
     @ti.func
     def number(self):
-        """Number the tiles that marked ones reach; return whether there is room for all of them."""
+        """Number the tiles reached from marked tiles; return whether the allocated blocks suffice."""
         wanted = 1
         for s in range(self._spans):
             if self._marked[s] == 1:
@@ -375,7 +383,7 @@ class SparseGrid(BlockNodes, Grid):
 
     @ti.func
     def mark_reached(self, tile: int):
-        """Mark the tiles that the particles of a tile reach."""
+        """Mark the tiles that particles of a tile can reach."""
         place = self.tile_place(tile)
         for q in range(ti.static(self._most**self.dimension)):
             rest, index, exists = q, 0, True
@@ -391,7 +399,7 @@ class SparseGrid(BlockNodes, Grid):
 
     @ti.func
     def find_pencils(self):
-        """Find the pencils of the blocks in use, and of each colour."""
+        """Find the pencils of the blocks in use and those of each colour."""
         for colour in range(ti.static(2 ** (self.dimension - 1))):
             self.sizes[COLOURS + colour] = 0
         count, before = 0, -1
@@ -412,7 +420,7 @@ class SparseGrid(BlockNodes, Grid):
 
 @ti.data_oriented
 class BlockOrder(TileOrder):
-    """The tile order of one group on a sparse grid: of the tiles that have numbers."""
+    """Tile order of one group on a sparse grid, over the numbered tiles."""
 
     @ti.func
     def pencil_count(self, colour: int):
@@ -432,9 +440,13 @@ class BlockOrder(TileOrder):
 
 
 def reach_along(cells: int, tile: int, beyond: tuple[int, int], *, repeats: bool) -> np.ndarray:
-    """Return per tile of an axis those that its particles reach, images included, (tiles, k), padded with -1.
+    """Return, per tile of an axis, the tiles that its particles reach, including images, (tiles, k), padded with -1.
 
-    cells: of the domain; tile: edge of a tile, cells; beyond: nodes that stencils reach before the tile, and behind it.
+    Args:
+        cells: cells of the domain along the axis.
+        tile: edge of a tile, cells.
+        beyond: numbers of nodes that stencils reach before and behind the tile.
+        repeats: whether the axis is periodic.
     """
     tiles, last = -(-(cells + 1 + 2 * PAD) // tile), cells + PAD
     found = []
@@ -442,7 +454,7 @@ def reach_along(cells: int, tile: int, beyond: tuple[int, int], *, repeats: bool
         low, high = t * tile - beyond[0], (t + 1) * tile - 1 + beyond[1]
         ranges = [(low, high)]
         if repeats:
-            # Of a node near a face there is an image as far inside of the other one.
+            # A node near a face has an image at the same distance inside of the opposite face.
             if low <= 2 * PAD:
                 ranges.append((low + cells, min(high, 2 * PAD) + cells))
             if high >= last - PAD:
@@ -468,10 +480,10 @@ def first_nodes_of(position: np.ndarray, scene: Scene) -> np.ndarray:
 
 
 def tiles_reached(first_nodes: np.ndarray, tile: int, reach: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the tiles that particles may write, sorted, from the first nodes of their stencils, (n, d)."""
+    """Return the sorted indices of tiles that particles may write, given the first nodes of their stencils, (n, d)."""
     shape = tuple(len(table) for table in reach)
     found = np.unique(np.ravel_multi_index(tuple((first_nodes // tile).T), shape))
-    # Along one axis after the other, which keeps few of them twice.
+    # Axis by axis, which creates few duplicates.
     for axis, table in enumerate(reach):
         places = list(np.unravel_index(found, shape))
         along = table[places[axis]]
@@ -481,12 +493,12 @@ def tiles_reached(first_nodes: np.ndarray, tile: int, reach: Sequence[np.ndarray
     return found
 
 
-# Cells from which on a grid may be sparse by itself, and then the share of them that material fills at most.
+# Smallest number of cells of a grid that is sparse with "auto", and the largest filled fraction of its cells.
 MANY_CELLS, FILLED = 8_000_000, 0.05
 
 
 def wants_sparse(scene: Scene) -> bool:
-    """Return whether the grid of a scene is sparse on the CPU, whatever machine that is."""
+    """Return whether the grid of a scene is sparse on the CPU; the result does not depend on the machine."""
     if scene.solver.grid != "auto":
         return scene.solver.grid == "sparse"
     if any(map(scene.separates, scene.sources)):
@@ -496,11 +508,11 @@ def wants_sparse(scene: Scene) -> bool:
 
 
 def filled_cells(scene: Scene) -> float:
-    """Return the number of cells that all material of a scene fills at rest."""
+    """Return the number of cells filled by all material of a scene at rest."""
     bodies = sum(estimate_body(body, scene.domain.spacing) / body.particles_per_cell for body in scene.bodies)
     return bodies + sum(sheets_of(emitter, scene).particles / emitter.particles_per_cell for emitter in scene.emitters)
 
 
 def require_cpu_if_sparse(settings: SolverSettings, backend: Backend) -> None:
     if settings.grid == "sparse" and not backend.on_cpu:
-        raise InputError('solver.grid = "sparse" is for the CPU; give "auto" or "dense", or --arch cpu.')
+        raise InputError('solver.grid = "sparse" is available only on the CPU; use "auto" or "dense", or --arch cpu.')

@@ -1,4 +1,4 @@
-"""Starts Taichi, once per process, on the requested backend, and tells what works on this machine, and its memory."""
+"""Starts Taichi, once per process, on the requested backend; finds available backends and free memory."""
 
 import ast
 import atexit
@@ -32,8 +32,9 @@ from mpmcli.errors import InputError, RunError
 from mpmcli.plain_text import counted
 from mpmcli.quick_taichi import ti
 
-# Taichi's optimisations: all, all but those across branches, or few. Those across branches take half to three quarters
-# of the time to compile for a CPU, and save nothing. Few halve the rest, and steps are 7 to 30 % slower.
+# Taichi's optimisations: all, all except those across branches, or few. Optimisations across branches take half to
+# three quarters of the compile time on a CPU without making steps faster. "few" halves the remaining compile time, and
+# steps are 7 to 30 % slower.
 Optimisation = Literal["all", "most", "few"]
 OPTIMISATION: dict[str, dict[str, bool]] = {
     "all": {},
@@ -44,15 +45,15 @@ OPTIMISATION: dict[str, dict[str, bool]] = {
 Arch = Literal["auto", "cpu", "cuda", "vulkan", "metal"]
 ARCHES: tuple[str, ...] = ("auto", "cpu", "cuda", "vulkan", "metal")
 
-# Threads that are accepted on any machine; beyond that, twice the number of cores.
+# Number of threads accepted on any machine; the limit is twice the number of cores if that is larger.
 FEW_THREADS = 64
-# What compiled kernels may take on the disk: a kernel of four laws in 3D takes 6 MB, and is there twice.
+# Largest size of the cache of compiled kernels: a kernel of four laws in 3D takes 6 MB and is stored twice.
 CACHE_BYTES = 2**29
-# Age, s, at which a lock on the compiled kernels counts as left behind by a killed process.
+# Age, s, from which a lock on the kernel cache is considered left by a killed process.
 LONGEST_LOCK = 60.0
 
 _started: "Backend | None" = None
-# What is called once after the backend has ended.
+# Functions called once after the backend has stopped.
 _endings: list[Callable[[], None]] = []
 
 
@@ -61,10 +62,10 @@ class Backend:
     """The backend that runs the kernels: "cpu", "cuda", "vulkan" or "metal".
 
     Attributes:
-        threads: CPU threads that kernels use (1 on a GPU).
-        precision: "f32" or "f64", the type of every particle and node value.
-        compile_cache: whether compiled kernels are kept for the next start.
-        optimisation: how much of Taichi's optimisation kernels get; results have the same bytes with any.
+        threads: CPU threads used by kernels (1 on a GPU).
+        precision: "f32" or "f64", the type of all particle and node values.
+        compile_cache: whether compiled kernels are cached on disk.
+        optimisation: level of Taichi's optimisation; results are identical in every byte at all levels.
     """
 
     arch: str
@@ -80,7 +81,7 @@ class Backend:
 
     @property
     def doubles(self) -> bool:
-        """Whether the device has double precision, in which a run counts its time."""
+        """Whether the device has double precision, in which a run accumulates its time."""
         return self.arch != "metal"
 
 
@@ -92,17 +93,18 @@ def choose_backend(
     compile_cache: bool = True,
     optimisation: Optimisation | None = None,
 ) -> Backend:
-    """Return the backend that a name stands for on this machine; it is not started.
+    """Return the backend for a name on this machine without starting it.
 
-    "auto" takes CUDA where a driver and a device are present, Metal on a Mac, and otherwise the CPU. Vulkan is taken
-    only by name, since software Vulkan counts as a device.
+    "auto" selects Metal on a Mac (in f32), CUDA if a driver and a device are present, and otherwise the CPU. Vulkan is
+    selected only by name, because software Vulkan counts as a device.
 
     Args:
-        threads: of the CPU; None for one on each core.
-        optimisation: None for most on the CPU, and all on a GPU.
+        threads: number of CPU threads; None for one per core.
+        optimisation: None for "most" on the CPU and "all" on a GPU.
 
     Raises:
-        InputError: it cannot do this precision, or not with so many threads.
+        InputError: the backend or the precision is unknown, the backend lacks the precision, or the number of threads
+            is out of range.
     """
     if arch not in ARCHES:
         raise InputError(f'--arch "{arch}" is not a backend; use one of {", ".join(ARCHES)}.')
@@ -115,16 +117,16 @@ def choose_backend(
     count = (threads or cores) if wanted == "cpu" else 1
     most = max(FEW_THREADS, 2 * cores)
     if not 1 <= count <= most:
-        raise InputError(f"--threads {count} is not possible; give 1 to {most}, best {cores} on this machine.")
+        raise InputError(f"--threads {count} is not possible; give 1 to {most}, ideally {cores} on this machine.")
     usual: Optimisation = "most" if wanted == "cpu" else "all"
     return Backend(wanted, count, precision, compile_cache, optimisation or usual)
 
 
 def start(backend: Backend) -> Backend:
-    """Start Taichi and return the backend; a second call must request the same, but for its optimisation.
+    """Start Taichi and return the backend; a second call must request the same backend, apart from its optimisation.
 
     Raises:
-        InputError: the backend is not there, or another one is running.
+        InputError: the backend is not available, or another one is running.
     """
     global _started
     if _started is not None:
@@ -142,12 +144,12 @@ def start(backend: Backend) -> Backend:
 def start_backend(
     arch: Arch = "auto", threads: int | None = None, precision: str = "f32", *, compile_cache: bool = True
 ) -> Backend:
-    """Start what `choose_backend` returns; see both for the errors."""
+    """Start the result of `choose_backend`; for errors see `choose_backend` and `start`."""
     return start(choose_backend(arch, threads, precision, compile_cache=compile_cache))
 
 
 def stop_backend() -> None:
-    """End the running backend, and with it every field and kernel; another may start then."""
+    """Stop the running backend and free all fields and kernels; another backend may start afterwards."""
     global _started
     ti.reset()
     _forget_kernels()
@@ -157,28 +159,28 @@ def stop_backend() -> None:
 
 
 def after_stop(ending: Callable[[], None]) -> None:
-    """Call a function once after the backend has ended, which it does with the process at the latest."""
+    """Call a function once after the backend has stopped, at the latest at the end of the process."""
     if ending not in _endings:
         _endings.append(ending)
-    # Once, however often.
+    # Registered only once.
     atexit.unregister(stop_backend)
     atexit.register(stop_backend)
 
 
 def _forget_kernels() -> None:
-    """Let go of kernels, of which Taichi keeps a list; those made in a function hold everything they were made for."""
+    """Free kernels, which Taichi keeps in a list; kernels defined in a function keep objects of their closure alive."""
     runtime = ti.lang.impl.get_runtime()
     known = [weakref.ref(kernel) for kernel in runtime.kernels]
     runtime.kernels = []
     gc.collect()
     runtime.kernels = [kernel for reference in known if (kernel := reference()) is not None]
     for kernel in runtime.kernels:
-        # By the fields that it was called with; what was compiled for them is gone.
+        # The mapping refers to the fields of earlier calls, whose compiled code no longer exists.
         kernel.mapper.mapping.clear()
 
 
 def _settle_cache() -> None:
-    """Set a writable cache directory, without which Taichi crashes at exit, and free the lock of a killed process."""
+    """Set a writable cache directory, without which Taichi crashes at exit, and remove the lock of a killed process."""
     os.environ.pop("TI_OFFLINE_CACHE_FILE_PATH", None)
     try:
         folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "taichi"
@@ -188,13 +190,13 @@ def _settle_cache() -> None:
         lock = folder / "ticache" / "ticache.lock"
         if lock.exists() and time.time() - lock.stat().st_mtime > LONGEST_LOCK:
             lock.unlink(missing_ok=True)
-    # A user without a home and without an entry for users.
+    # A user without a home directory and without a password entry.
     except (OSError, RuntimeError):
         os.environ["XDG_CACHE_HOME"] = _spare_cache()
 
 
 def _spare_cache() -> str:
-    """Return a directory among temporary files, the same for every run of this user, if nobody else can write there."""
+    """Return a directory for temporary files, the same for all runs of this user if no other user can write there."""
     user = os.getuid() if hasattr(os, "getuid") else 0
     place = Path(tempfile.gettempdir()) / f"mpmcli-cache-{user}"
     with contextlib.suppress(OSError):
@@ -206,26 +208,27 @@ def _spare_cache() -> str:
 
 
 def _best(precision: str) -> str:
-    """Name the fastest backend that this machine has for this precision."""
+    """Return the name of the fastest backend of this machine for this precision."""
     if platform.system() == "Darwin" and precision == "f32" and backend_is_here("metal"):
         return "metal"
     return "cuda" if backend_is_here("cuda") else "cpu"
 
 
 def backend_is_here(arch: str) -> bool:
-    """Return whether this machine has a device for a backend; it may still fail to start."""
+    """Return whether this machine has a device for a backend; the backend may still fail to start."""
     if arch == "cpu":
         return True
-    # Taichi loads CUDA wherever the driver's library is present, and ends the process without a device.
+    # Taichi loads CUDA if the library of the driver is present, and ends the process if there is no device.
     if arch == "cuda" and not has_cuda_device():
         return False
     return bool(ti.lang.misc.is_arch_supported(getattr(ti, arch)))
 
 
 def _position(context: ASTTransformerContext, node: ast.AST) -> str:
-    """Return the position of a node of a kernel's source, for Taichi's error messages.
+    """Return the source position of a node of a kernel, for error messages of Taichi.
 
-    Taichi's own function, which runs for every node, takes a quarter of the start of a run whose kernels are cached.
+    Taichi's own function, which is called for every node, takes a quarter of the start time of a run with cached
+    kernels.
     """
     line = node.lineno + context.lineno_offset
     return f'File "{context.file}", line {line}, in {context.func.func.__name__}:\n'
@@ -233,19 +236,19 @@ def _position(context: ASTTransformerContext, node: ast.AST) -> str:
 
 @cache
 def _source(code: CodeType) -> tuple[list[str], int]:
-    """Return the lines of a function and the number of the first; a code object keeps no fields alive.
+    """Return the lines of a function and the number of the first; the cached code object keeps no fields alive.
 
-    `inspect.getsourcelines` would look for the module among all that are loaded.
+    `inspect.getsourcelines` would search all loaded modules.
     """
     first = code.co_firstlineno
     return inspect.getblock(linecache.getlines(code.co_filename)[first - 1 :]), first
 
 
 def _builder(kernel: Kernel) -> object:
-    """Return what collects the statements of the function that is being compiled.
+    """Return the AST builder of the function that is being compiled.
 
-    Taichi's own method returns that of the kernel, and a loop in a function that a real function inlines ends the
-    process.
+    Taichi's own method returns the builder of the kernel; then a loop in a function inlined by a real function crashes
+    the process.
     """
     return ti.lang.impl.get_runtime().compiling_callable.ast_builder()
 
@@ -254,17 +257,18 @@ def _initialise(backend: Backend) -> None:
     if not backend_is_here(backend.arch):
         raise InputError(f"--arch {backend.arch} needs a device that this machine does not have; use --arch cpu.")
     arch = getattr(ti, backend.arch)
-    # This variable would override `arch`. Taichi prints a line to standard output when it starts.
+    # This variable would override `arch`. (Standard output is redirected below because Taichi prints a line when it
+    # starts.)
     os.environ.pop("TI_ARCH", None)
     _settle_cache()
     ASTTransformerContext.get_pos_info = _position
     Kernel.ast_builder = _builder
-    # Taichi asks for all of this anew each time that it inlines a function, and wraps lines at 9,999 columns: together
-    # a fifth of the work of its front end.
+    # Taichi recomputes these each time it inlines a function, and wraps lines at 9,999 columns, which together is a
+    # fifth of the time of its front end.
     ti.lang.kernel_impl.getsourcelines = lambda function: _source(function.__code__)
     ti.lang.kernel_impl.getsourcefile = lambda function: function.__code__.co_filename
     ti.lang.kernel_impl.textwrap = SimpleNamespace(fill=lambda line, **_: line.rstrip(), dedent=textwrap.dedent)
-    # Taichi would warn of each of its variables that `ti.init` overrides, before it reads `log_level`.
+    # Before it reads `log_level`, Taichi would warn of each environment variable that `ti.init` overrides.
     ti.set_logging_level(ti.ERROR)
     with contextlib.redirect_stdout(io.StringIO()):
         ti.init(
@@ -273,27 +277,28 @@ def _initialise(backend: Backend) -> None:
             cpu_max_num_threads=backend.threads,
             offline_cache=backend.compile_cache,
             offline_cache_max_size_of_files=CACHE_BYTES,
-            # Strict arithmetic is as fast on the CPU, and a NaN stays a NaN in every comparison.
+            # Strict arithmetic is as fast on the CPU, and comparisons with NaN remain correct.
             fast_math=False,
-            # Real functions may write what a serial loop would keep in variables; steps are as fast without.
+            # Real functions may write values that a serial loop would cache in variables; steps are equally fast
+            # without.
             cache_loop_invariant_global_vars=not backend.on_cpu,
             log_level=ti.ERROR,
             **OPTIMISATION[backend.optimisation],
         )
     came = ti.lang.impl.current_cfg().arch
     if came != arch:
-        raise InputError(f"--arch {backend.arch} did not start ({came.name} came instead); use --arch cpu.")
+        raise InputError(f"--arch {backend.arch} did not start (Taichi started {came.name} instead); use --arch cpu.")
 
 
 COUNT = 1000
 
 
 def try_backend(arch: Arch) -> Backend:
-    """Start a backend in f32, fill a field by a kernel, and return the backend if the numbers are right.
+    """Start a backend in f32, fill a field by a kernel, and return the backend if the values are correct.
 
     Raises:
-        InputError: the backend is not there, does not start, or another one is running.
-        RunError: the kernel computed something else.
+        InputError: the backend is not available, does not start, or another one is running.
+        RunError: the values are wrong.
     """
     started = start_backend(arch)
     squares = ti.field(ti.f32, COUNT)
@@ -304,9 +309,9 @@ def try_backend(arch: Arch) -> Backend:
             squares[i] = float(i) * float(i)
 
     fill()
-    # Squares of whole numbers below 2^12 are exact in f32.
+    # Squares of integers below 2^12 are exact in f32.
     if not np.array_equal(squares.to_numpy(), np.arange(COUNT, dtype=np.float32) ** 2):
-        raise RunError(f"the kernel that tried --arch {arch} computed wrong numbers.")
+        raise RunError(f"the test kernel of --arch {arch} computed wrong values.")
     return started
 
 
@@ -315,12 +320,15 @@ WORDS = ("out of memory", "out_of_memory", "failed to allocate", "out_of_device_
 
 # Taichi addresses fields with 32-bit integers.
 LARGEST_INDEX = 2**31 - 1
-# Share of the free memory that a run may plan for.
+# Fraction of the free memory that a run may use.
 MEMORY_SHARE = 0.8
 
 
 def has_cuda_device() -> bool:
-    """Return whether there is a device: a file in /dev, any one of those of its machine in a container, or as told."""
+    """Return whether there is a CUDA device, according to device files in /dev or to the driver.
+
+    In a container the files may be those of any device of the host.
+    """
     if any(Path("/dev").glob("nvidia[0-9]*")) or os.path.exists("/dev/dxg"):
         return True
     count = ctypes.c_int()
@@ -332,7 +340,7 @@ def has_cuda_device() -> bool:
 
 
 def free_memory(arch: str) -> int | None:
-    """Return the bytes that are free on the device that Taichi takes; None where it uses those of the machine."""
+    """Return the free bytes of the device that Taichi uses; None if it uses main memory or the size is unknown."""
     if arch != "cuda":
         return None
     try:
@@ -342,7 +350,7 @@ def free_memory(arch: str) -> int | None:
 
 
 def _free_cuda_memory(driver: ctypes.CDLL) -> int | None:
-    """Ask the driver for the first device's; the context is the one that Taichi will use."""
+    """Return the free bytes of the first device from the driver, in the context that Taichi will use."""
     device, context, free, total = ctypes.c_int(), ctypes.c_void_p(), ctypes.c_size_t(), ctypes.c_size_t()
     if driver.cuInit(0) or driver.cuDeviceGet(ctypes.byref(device), 0):
         return None
@@ -359,7 +367,7 @@ def _free_cuda_memory(driver: ctypes.CDLL) -> int | None:
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Return whether an error says that memory of the device, or of this machine, could not be allocated."""
+    """Return whether an error reports a failed allocation of memory on the device or on this machine."""
     if isinstance(error, MemoryError):
         return True
     said = str(error).lower()
@@ -370,6 +378,6 @@ def out_of_memory_sentence(arch: str, error: BaseException) -> str:
     first = (str(error).strip().splitlines() or [type(error).__name__])[-1].strip().rstrip(".")
     where = "this machine" if arch == "cpu" else f"the {arch} device"
     return (
-        f"The memory of {where} does not suffice ({first}): take a larger domain.spacing or fewer particles_per_cell, "
-        "or end other programs that use it."
+        f"There is not enough memory on {where} ({first}): use a larger domain.spacing or fewer particles_per_cell, "
+        "or end other programs that use memory."
     )

@@ -1,9 +1,9 @@
-"""Memory, passes and time that a scene needs, known before anything is allocated.
+"""Memory, passes and time of a scene, computed before anything is allocated.
 
-Arrays have few sizes: these are a part of kernels, which are found again for other scenes. The time on the CPU, of the
-compilation and of a step, follows from a table of measured kinds. The table is of one machine, see
-`scripts/measure_costs`: it tells which of Taichi's optimisations pay, which depends on ratios alone, and what a run
-takes, to a factor of two.
+Array sizes are rounded to few values, because they are part of compiled kernels: other scenes then reuse cached
+kernels. CPU times of the compilation and of a step follow from a table of measurements on one machine
+(`scripts/measure_costs`). The table determines which of Taichi's optimisations pay off, which depends only on ratios,
+and predicts the time of a run to a factor of two.
 """
 
 import math
@@ -45,12 +45,12 @@ from mpmcli.solver.transfer.redistribution import fine_nodes
 from mpmcli.solver.transfer.splines import scheme_of
 from mpmcli.solver.transfer.volume import averages_volume, needs_filling
 
-# Entries, and colliders, up to which there is room for as many.
+# Smallest numbers of entries and of colliders for which arrays have space.
 FEWEST, FEWEST_COLLIDERS = 1024, 4
-# Cells along an axis are multiples of these in 2D and 3D where they are few, and of the third otherwise.
+# Up to FEW_CELLS cells along an axis, their number is a multiple of FEW_TIMES in 2D and 3D; above, at least of CELLS.
 FEW_CELLS, FEW_TIMES, CELLS = 64, {2: 16, 3: 8}, 4
-# Entries by which more are off from multiples of powers of two: arrays of such sizes, one after the other, begin in the
-# same set of lines of a cache, and steps in 2D take a fifth longer.
+# Entries added to larger sizes, which are multiples of powers of two: consecutive arrays of such sizes would begin in
+# the same cache set, and steps in 2D take a fifth longer.
 SKEW = 336
 
 
@@ -60,14 +60,14 @@ def power_of_two(count: int) -> int:
 
 
 def in_steps(count: int) -> int:
-    """Return room for so many entries, in eighths of a power of two: none, or `FEWEST` at least."""
+    """Return the padded number of entries, in eighths of a power of two; at least `FEWEST`, or 0 for 0."""
     if count > FEWEST:
         return _multiple(count - SKEW, power_of_two(count - SKEW) // 16) + SKEW
     return FEWEST if count else 0
 
 
 def padded_cells(cells: Sequence[int]) -> tuple[int, ...]:
-    """Return the cells per axis for which a dense grid has nodes, in sixteenths of a power of two above 64."""
+    """Return the padded cells per axis of a dense grid, in sixteenths of a power of two above 64."""
     few = FEW_TIMES[len(cells)]
     return tuple(_multiple(n, few if n <= FEW_CELLS else max(CELLS, power_of_two(n) // 32)) for n in cells)
 
@@ -83,25 +83,25 @@ def _multiple(count: int, step: int) -> int:
 
 
 TABLE = Path(__file__).with_name("costs.toml")
-# Seconds of a compilation that several laws share.
+# Seconds of compilation shared by all laws.
 SHARED = 1.0
-# What threads are worth: the power of their number. Particles that are worth a thread.
+# Exponent of the speed-up by threads. Particles per thread from which a thread is useful.
 WORTH, WORTH_A_THREAD = 0.9, 2_500
 
 
 @dataclass(frozen=True)
 class Cost:
-    """Seconds to compile, and of a step on one thread."""
+    """Seconds of the compilation, and of a step on one thread."""
 
     compile: float
     step: float
 
     def step_on(self, threads: int) -> float:
-        """Return the seconds of a step on some threads."""
+        """Return the seconds of a step on a number of threads."""
         return self.step / threads**WORTH
 
     def seconds(self, steps: int, threads: int) -> float:
-        """Return what so many steps take, compilation included."""
+        """Return the seconds of a number of steps, including compilation."""
         return self.compile + steps * self.step_on(threads)
 
 
@@ -111,7 +111,7 @@ def _table() -> dict:
 
 
 def cost_of(scene: Scene, optimisation: Optimisation) -> Cost:
-    """Return the cost of a scene whose kernels get some of Taichi's optimisations; a law of a plugin costs most."""
+    """Return the cost of a scene at a level of optimisation; a plugin law costs as much as the most expensive law."""
     table, axis, h = _table(), scene.dimension - 2, scene.domain.spacing
     how = "few" if optimisation == "few" else "most"
     known = {law: entry[how][axis] for law, entry in table["laws"].items()}
@@ -135,47 +135,49 @@ def cost_of(scene: Scene, optimisation: Optimisation) -> Cost:
 
 
 def useful_threads(particles: int, threads: int) -> int:
-    """Return how many of these threads a run of so many particles has use for."""
+    """Return how many of these threads are useful to a run with this number of particles."""
     return min(threads, max(1, particles // WORTH_A_THREAD))
 
 
 def cheapest(scene: Scene, steps: int, threads: int) -> Optimisation:
-    """Return which optimisations make a run of so many steps end first."""
+    """Return the level of optimisation with the shortest total time of a run with this number of steps."""
     return min(("few", "most"), key=lambda how: cost_of(scene, how).seconds(steps, threads))
 
 
 def host_bytes_of(scene: Scene, members: Sequence[Law], particles: int, real: int, *, on_cpu: bool) -> int:
-    """Return the bytes that particles take on the host at most: at the start, or while a frame is built and written.
+    """Return the largest number of bytes of particles on the host: at the start, or while a frame is built and written.
 
-    Python, Taichi and its compiler take about 200 MB more. real: bytes of a real number on the device.
+    Python, Taichi and its compiler take about 200 MB more. `real` is the number of bytes of a real number on the
+    device.
     """
     d = scene.dimension
-    # Double precision: places, and where they vary velocities, their gradients and deformations.
+    # Double precision: positions, and if they depend on the position, velocities, their gradients and deformations.
     start = 8 * (d + any(map(has_expressions, scene.bodies)) * (d + 2 * d * d))
     columns = frame_columns(scene, members)
     widths = {"velocity": 0, "initial_position": d, "affine": d * d, "deformation_gradient": d * d, "stress": 9}
     fields = sum(widths.get(name, 1) for name in scene.output.fields)
-    # Of the frame: positions, velocities and fields.
+    # The frame: positions, velocities and fields.
     frame = real * (2 * d + fields) + scene.comes_and_goes
-    # The array that is being written: the number of each particle, or in 2D what has the components of 3D.
+    # The array that is being written: particle numbers, or in 2D a vector or matrix padded to 3D.
     frame += 4 if d == 3 else real * (3 if {"affine", "deformation_gradient"}.isdisjoint(scene.output.fields) else 9)
     if len(scene.sources) > 1:
         frame += 2 * np.dtype(np.int32).itemsize
     if "initial_position" in scene.output.fields:
         frame += real * d
     if not on_cpu:
-        # The state as it was copied, and what numpy makes of it.
+        # The copied state and its NumPy arrays.
         return particles * (start + frame + 2 * 8 * (2 * d + d * d))
     return particles * max(start, real * columns + frame)
 
 
 def frame_columns(scene: Scene, members: Sequence[Law]) -> int:
-    """Return how many numbers of each particle a frame is built from."""
+    """Return how many numbers per particle a frame is built from."""
     internal = max(len(law.internal) for law in members)
     return FrameColumns(scene.dimension, internal, scene.output.fields, comes_and_goes=scene.comes_and_goes).count
 
 
-# Phases of every step as users read them; volumes are relaxed in some only.
+# Names of the phases of every step in messages; the phases that relax volumes, which run in some steps only, are left
+# out.
 WORDS = {
     "clear": "clear grid",
     "average": "average volumes of {}",
@@ -194,7 +196,7 @@ WORDS = {
 
 @dataclass(frozen=True)
 class LawPlan:
-    """Memory of the particles of one law: an estimate of their number, and the bytes of each field of one."""
+    """Memory of the particles of one law: their estimated number, and the bytes of each field per particle."""
 
     law: str
     particles: int
@@ -203,16 +205,16 @@ class LawPlan:
 
 @dataclass(frozen=True)
 class Plan:
-    """Memory of a run, and the passes of its time step.
+    """Memory of a run and the passes of its time step.
 
     Attributes:
-        nodes: number of grid nodes, on a sparse grid those that there is memory for at first.
-        entries: of the longest array, which is addressed by one index: numbers of particles in a frame or in the sort,
-            counts of the tiles of each thread, nodes, fine ones, bins of bodies that meet.
-        scratch_bytes: per particle, of the sort buffers.
-        grid_bytes: of all nodes, the tables of the sort, what is found at walls, and what colliders need.
+        nodes: number of grid nodes; on a sparse grid, those allocated at first.
+        entries: entries of the longest array addressed by one index: particle data of a frame or of the sort, counts
+            per tile and thread, nodes, fine nodes, or bins of colliding bodies.
+        scratch_bytes: bytes of the sort buffers per particle.
+        grid_bytes: bytes of all nodes, of the tables of the sort, and of the data for walls and colliders.
         host_bytes: see `host_bytes_of`.
-        passes: the loops of a step in order; loops over particles name their law.
+        passes: loops of a step in order; loops over particles contain the name of their law.
     """
 
     laws: tuple[LawPlan, ...]
@@ -232,19 +234,19 @@ class Plan:
 
     @property
     def bytes_per_particle(self) -> int:
-        """Bytes of a particle of the law that takes most, sort buffers included."""
+        """Bytes per particle of the law with the largest particles, including sort buffers."""
         return max(sum(law.fields.values()) for law in self.laws) + self.scratch_bytes
 
     @property
     def device_bytes(self) -> int:
-        """Bytes on the device; the sort buffers hold the largest group."""
+        """Bytes on the device; the sort buffers have the size of the largest group."""
         rooms = [in_steps(law.particles) for law in self.laws]
         state = sum(room * sum(law.fields.values()) for law, room in zip(self.laws, rooms, strict=True))
         return state + max(rooms) * self.scratch_bytes + self.grid_bytes
 
     @property
     def machine_bytes(self) -> int:
-        """Bytes of the machine's own memory: all but those that a CUDA device has itself."""
+        """Bytes of main memory: all except the memory of a CUDA device."""
         return self.host_bytes + (0 if self.arch == "cuda" else self.device_bytes)
 
     def as_dict(self) -> dict:
@@ -261,14 +263,14 @@ class Plan:
 
 
 def bytes_of_fields(law: type[Law], dimension: int, precision: str, **asked: bool) -> dict[str, int]:
-    """Return the bytes of each field of one particle of a law, by name; see `particle_fields` for what is asked."""
+    """Return the bytes of each field of one particle of a law, by name; for `asked` see `particle_fields`."""
     real, internal = 8 if precision == "f64" else 4, law.parameters.internal_in(dimension)
     fields = particle_fields(law.deformation, [v.name for v in internal], dimension, precision, **asked)
     return {name: rows * columns * (real if kind is float else 4) for name, (kind, rows, columns) in fields.items()}
 
 
 def passes_of(members: Sequence[Law], scene: Scene, *, deterministic: bool = False) -> tuple[str, ...]:
-    """Return the loops of one step; `deterministic` where P2G is in fixed point."""
+    """Return the loops of one step; `deterministic` is whether P2G is in fixed point."""
     layers = Layers.of(scene)
     phases = step_phases(
         members,
@@ -345,13 +347,13 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
     filling, deterministic = needs_filling(scene, members, layers), scene.solver.deterministic and not backend.on_cpu
     numbers = layers * width * (1 + scheme.keeps_flip_velocity + filling)
     node_bytes = real * (numbers + layers * 3 * sum(averaged))
-    # Nothing where that is 0.
+    # 0 without shifts.
     fine = fine_nodes(scene, members) ** dimension
     node_bytes += real * fine
     if deterministic:
         shared = sum(averaged)
         node_bytes += FixedPoint.bytes_needed(numbers, shared) + FixedPoint.bytes_needed(1, 0) * fine
-        # In their place.
+        # The fixed-point means replace the floating-point ones.
         node_bytes -= real * 3 * shared
     all_tiles, bins = all_nodes // tile**dimension, 0
     tables = len(groups) * TileOrder.bytes_needed(blocks if sparse else all_tiles, backend.threads)
@@ -383,24 +385,24 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
 
 
 def _require_rigid_possible(scene: Scene) -> None:
-    """Refuse a scene with colliders that move freely, and something that they cannot meet.
+    """Raise an error for a scene that combines freely moving colliders with an unsupported feature.
 
     Raises:
-        InputError: says what.
+        InputError: names the feature.
     """
     domain = scene.domain
     reasons = {
         "in a domain with periodic walls": any(domain.periodic),
-        "beside walls that move": bool(domain.wall_velocity),
-        "beside bodies that separate": Layers.of(scene).separate,
+        "with moving walls": bool(domain.wall_velocity),
+        "with separating bodies": Layers.of(scene).separate,
     }
     for reason, applies in reasons.items():
         if applies and any(collider.free for collider in scene.colliders):
-            raise InputError(f"colliders with a density are not available {reason}; leave their density out.")
+            raise InputError(f"colliders with a density are not available {reason}; omit their density.")
 
 
 def _separating_axes(scene: Scene) -> list[int]:
-    """Return the axis of every face that needs contact flags: separating ones of the grid."""
+    """Return the axis of each separating face of the grid, which needs contact flags."""
     if scene.solver.solids == "total":
         return []
     faces = scene.domain.walls.faces(scene.dimension)
@@ -408,13 +410,13 @@ def _separating_axes(scene: Scene) -> list[int]:
 
 
 def _rough_axes(scene: Scene) -> list[int]:
-    """Return the axis of every face of the grid that has friction."""
+    """Return the axis of each face of the grid with friction."""
     total, faces = scene.solver.solids == "total", scene.domain.walls.faces(scene.dimension)
     return [axis for axis, side in rough_faces(scene) if not (total and faces[axis][side] == "separate")]
 
 
 def _contact_bytes(scene: Scene, nodes: int, tile: int, tiles: Sequence[int], real: int) -> int:
-    """Return the bytes of what is found at walls: for each node of a plane an integer, with friction a vector."""
+    """Return the bytes of data at walls: an integer per node of a separating plane, a vector per node with friction."""
     separating, rough = (
         [nodes // (tile * tiles[axis]) for axis in axes] for axes in (_separating_axes(scene), _rough_axes(scene))
     )
@@ -423,18 +425,18 @@ def _contact_bytes(scene: Scene, nodes: int, tile: int, tiles: Sequence[int], re
 
 
 def require_memory(plan: Plan) -> None:
-    """Refuse, by an InputError, what exceeds the free memory of this machine or its device, or 32-bit indices."""
+    """Raise an InputError if a plan exceeds the free memory of this machine or its device, or 32-bit indices."""
     total = plan.machine_bytes
     free = MEMORY_SHARE * psutil.virtual_memory().available
     on_device = free_memory(plan.arch)
     need = f"the scene needs {plan.particles:.3g} particles and {plan.nodes:.3g} grid nodes"
-    cure = "a larger domain.spacing or fewer particles_per_cell needs less"
+    cure = "use a larger domain.spacing or fewer particles_per_cell"
     if total > free:
-        raise InputError(f"{need}, {size_text(total)} of memory, and {size_text(free)} may be used here; {cure}.")
+        raise InputError(f"{need}, {size_text(total)} of memory, but at most {size_text(free)} may be used; {cure}.")
     if on_device is not None and plan.device_bytes > MEMORY_SHARE * on_device:
         raise InputError(
-            f"{need}, {size_text(plan.device_bytes)} of memory on the {plan.arch} device, and "
-            f"{size_text(MEMORY_SHARE * on_device)} may be used there; {cure}."
+            f"{need}, {size_text(plan.device_bytes)} of memory on the {plan.arch} device, but at most "
+            f"{size_text(MEMORY_SHARE * on_device)} may be used; {cure}."
         )
     if plan.entries > LARGEST_INDEX:
         raise InputError(f"{need}, more than 32-bit indices can address; {cure}.")

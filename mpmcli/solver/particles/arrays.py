@@ -1,4 +1,4 @@
-"""The fields of particles of one law on the device, what kernels read of them, and copies from and to the host."""
+"""Particle fields of one law on the device, accessors for kernels, and copies from and to the host."""
 
 from collections.abc import Sequence
 from copy import copy
@@ -10,14 +10,14 @@ from mpmcli.materials.law import Law
 from mpmcli.quick_taichi import ti
 from mpmcli.solver.grid.period import Period
 
-# Particles of a launch that reads them: with up to 27 numbers each, their entries stay within 32-bit indices, and a GPU
-# needs half a gigabyte for them.
+# Particles per launch of a read: with up to 27 numbers each, entries stay within 32-bit indices and need half a
+# gigabyte on a GPU.
 MOST_READ = 2**22
 
 
-# Entries of the per-body table that come before the constants of the law.
+# Columns of the per-body table: mass, volume, and the first constant of the law.
 MASS, VOLUME, CONSTANTS = 0, 1, 2
-# Numbers behind the last field.
+# Spare numbers after the last field.
 SPARE = 16
 
 
@@ -35,10 +35,10 @@ def particle_fields(
     comes_and_goes: bool = False,
     surfaced: bool = False,
 ) -> dict[str, tuple[type, int, int]]:
-    """Return the fields of particles by name: float or int, rows and columns; options as of `ParticleArrays`."""
+    """Return kind (float or int), rows and columns of each particle field by name; for options see `ParticleArrays`."""
     d = dimension
     fields = {"position": (float, d, 1), "velocity": (float, d, 1)}
-    # In single precision a column more, see `ParticleArrays.gradient`.
+    # One more column in single precision, see `ParticleArrays.gradient`.
     fields["velocity_gradient"] = (float, d, d + (precision == "f32"))
     if deformation == "F":
         fields["deformation_gradient"] = (float, d, d)
@@ -62,40 +62,50 @@ def _field(count: int, kind: type, rows: int, columns: int) -> ti.Field:
 
 @ti.data_oriented
 class ParticleArrays:
-    """Fields of particles of one law, of one run or of several, each of which has a contiguous range.
+    """Fields of the particles of one law, of one or several runs, each with a contiguous range of particles.
 
-    The same entry of neighbouring particles lies together in memory, so that a CPU loads and stores as many at once as
-    a vector register holds, and a GPU those of neighbouring threads. A few places behind the last particle may be read.
+    The same entry of neighbouring particles is contiguous in memory, so that a CPU can load and store whole vector
+    registers, and a GPU the entries of neighbouring threads at once. A few entries beyond the last particle may be
+    read.
 
     Attributes:
-        law: the constitutive law; capacity: particles n; dimension: d.
-        x: position relative to the origin of the domain, (n) Vector(d), m; v: velocity, (n) Vector(d), m/s.
-        gradient: of the velocity, (n) matrix of d rows, 1/s: row a holds dv/dx_a, the transpose of C, and then the
-            remainder of x along a, m, where the group `carries` one.
-        carries: whether particles carry what rounding takes from x, see `ParticleUpdate.moved`: in single precision.
-        displacement_gradient: F - I, (n) matrix d x d; None where the law keeps J.
-        J_minus_1: J - 1, (n); None where the law keeps F. Both are stored as the difference from rest: a step adds
-            strains of 1e-6 and less, which single precision would round off next to 1.
-        internal: the law's internal variables, (n) each; id: (n) int, row of the particle in every frame.
-        body: (n) int, row of its body in the table; None unless particles may belong to `many_bodies`.
-        serial: whether loops that copy particles from and to the host run on one thread, which few particles need.
-        total: whether the body is on the grid of its state at rest, see `total_solids`.
-        initial: position at the start as x, (n) Vector(d), m, of groups that keep it (`keeps_initial`) for a force, or
-            since they are `total`.
-        uses_f_bar: whether particles of a cell share their change of volume (`transfer.volume`): then each has its
-            `cell`, (n), and `to_mean`, (n), ln J during P2G, and for a frame what it lacks to the mean of its cell.
-        growth: by which ln J of such a particle grew in the last step, (n); None unless the group is `evened`: where
-            particles change cells they take the mean growth of their cell in G2P.
-        slip: how far a particle has slipped on the wall that pushes it, (n) Vector(d), m, where there is friction
+        law: the constitutive law.
+        capacity: number of particles n.
+        dimension: d.
+        x: position relative to the origin of the domain, (n) Vector(d), m.
+        v: velocity, (n) Vector(d), m/s.
+        gradient: velocity gradient, (n) matrix with d rows, 1/s: row a is dv/dx_a (the transpose of C), followed by the
+            remainder of x along a, m, if the group `carries` remainders.
+        carries: whether particles store the rounding error of x, see `ParticleUpdate.moved`; true in single precision.
+        displacement_gradient: F - I, (n) matrix d x d; None if the law stores J.
+        J_minus_1: J - 1, (n); None if the law stores F. Both are stored as the difference from rest, because a step
+            adds strains of 1e-6 and less, which single precision would lose next to 1.
+        internal: the internal variables of the law, (n) each.
+        id: (n) int, row of the particle in every frame.
+        body: (n) int, row of the body in the table; None unless `many_bodies`.
+        serial: whether loops that copy particles from and to the host run on one thread, as for few particles.
+        total: whether the grid is that of the state at rest (total Lagrangian), see `total_solids`.
+        initial: initial position relative to the origin, (n) Vector(d), m; stored (`keeps_initial`) if a force needs it
+            or the group is `total`.
+        uses_f_bar: whether particles of a cell share their change of volume (`transfer.volume`).
+        cell, to_mean: with `uses_f_bar`, the cell of each particle, (n), and its ln J during P2G, (n), or for a frame
+            the mean of ln J over the cell minus its own.
+        growth: growth of ln J in the last step, (n); None unless the group is `evened`.
+        evened: whether particles take the mean growth of their cell in G2P, because they change cells: `uses_f_bar` and
+            not `total`.
+        slip: slip of a particle on the wall that pushes it, (n) Vector(d), m; stored with friction
             (`has_wall_friction`), see `total_solids`.
-        carried: (n) Vector(d + 1), the normal to the nearest face of the body at rest, and the depth below it, m, of
-            groups whose bodies may have layers of their own (`surfaced`), see `contact.surfaces`.
-        layers: of the grid; layer: per row of the table, the layer of nodes of its body.
-        activity: (n) int, whether each waits, takes part or has left (`particles.sort`); None where all take part
-            always (`comes_and_goes` is false).
-        force: what acts on the particles where the group `has_body_force`; run: number of the run that a view is for.
-        table: per body a row of particle mass, particle volume and the constants of the law; kept: per body the share
-            that it keeps of its motion in this step, see `kept_motion`; real: numpy's type.
+        carried: (n) Vector(d + 1), the normal to the nearest face of the body at rest, and the depth below it, m;
+            stored in groups whose bodies may have their own layers (`surfaced`), see `contact.surfaces`.
+        layers: number of layers of the grid.
+        layer: per row of the table, the layer of nodes of the body.
+        activity: (n) int, status of each particle: waiting, active, retired or blocked (`particles.sort`); None if all
+            are always active (`comes_and_goes` is false).
+        force: the forces on the particles, if the group `has_body_force`.
+        run: number of the run of a view.
+        table: per body, a row of particle mass, particle volume and the constants of the law.
+        kept: per body, the fraction of its motion that it keeps in this step, see `kept_motion`.
+        real: NumPy type of real numbers.
     """
 
     def __init__(
@@ -115,7 +125,7 @@ class ParticleArrays:
         layers: int = 1,
         surfaced: bool = False,
     ) -> None:
-        """Allocate for `count` particles, and a table of these rows and columns."""
+        """Allocate fields for `count` particles, and a table with these numbers of rows and columns."""
         self.law, self.capacity = law, count
         self.dimension = d = dimension
         self.real = np.float64 if ti.lang.impl.current_cfg().default_fp == ti.f64 else np.float32
@@ -150,7 +160,7 @@ class ParticleArrays:
         self.table = ti.Vector.field(table[1], float, shape=table[0])
         self.kept = ti.field(float, shape=table[0])
         self.layer = ti.field(int, shape=table[0]) if layers > 1 else None
-        # Taichi lays fields out one after the other: what is read beyond the last particle lies in the next ones.
+        # Taichi stores fields one after the other, so that reads beyond the last particle fall into the next fields.
         self.spare = ti.field(float, shape=SPARE)
 
     def push_by(self, force: object) -> None:
@@ -160,7 +170,7 @@ class ParticleArrays:
         self.period, self.repeats = period, len(period.axes) > 0
 
     def seen_from(self, run: object) -> "ParticleArrays":
-        """Return the view that a run has: its number, a variable of a kernel, counts where forces are evaluated."""
+        """Return the view for a run; forces are evaluated with its number, a variable of a kernel."""
         view = copy(self)
         view.run = run
         if self.repeats:
@@ -169,7 +179,7 @@ class ParticleArrays:
 
     @property
     def state(self) -> tuple[ti.Field, ...]:
-        """Every real field that the sort must move."""
+        """All real fields that the sort moves."""
         initial = () if self.initial is None else (self.initial,)
         deformation = self.J_minus_1 if self.displacement_gradient is None else self.displacement_gradient
         more = tuple(field for field in (self.slip, self.growth, self.carried) if field is not None)
@@ -177,16 +187,16 @@ class ParticleArrays:
 
     @property
     def labels(self) -> tuple[ti.Field, ...]:
-        """Every integer field that the sort must move."""
+        """All integer fields that the sort moves."""
         return tuple(label for label in (self.id, self.body, self.activity) if label is not None)
 
     @property
     def moved(self) -> tuple[ti.Field, ...]:
-        """Every field that moves with a particle from place to place."""
+        """All fields that the sort moves."""
         return (*self.state, *self.labels)
 
     def fields(self) -> dict[str, ti.Field]:
-        """Return every field of the particles that changes during a run or is sorted, by name."""
+        """Return, by name, all particle fields that change during a run or are sorted."""
         names = ["position", "velocity", "velocity_gradient", "deformation", *(v.name for v in self.law.internal)]
         initial = (
             ["initial_position"] * self.keeps_initial
@@ -198,11 +208,15 @@ class ParticleArrays:
         return dict(zip([*names, *initial, *labels], (*self.state, *self.labels), strict=True))
 
     def read(self, first: int, count: int, bodies: Sequence[int], row: int = 0) -> dict[str, np.ndarray]:
-        """Return x, v, C, deformation, internal, (n, k), id and body, (n), of a range of particles.
+        """Return x, v, C, deformation, internal, (n, k), id and body, (n), for a range of particles.
 
-        All fields by one launch: one per field would take most of the time of a frame of few particles.
+        One launch reads all fields, because one per field would dominate the time of a frame of few particles.
 
-        bodies: index in the scene of each body of the group; row: of the first of them in the table.
+        Args:
+            first: the first particle.
+            count: number of particles.
+            bodies: index in the scene of each body of the group.
+            row: row of the first of these bodies in the table.
         """
         d = self.dimension
         widths = {"x": d, "v": d, "C": d * d, "deformation": self._deformation_width, "internal": len(self.internal)}
@@ -226,7 +240,7 @@ class ParticleArrays:
         return found
 
     def write(self, first: int, found: dict[str, np.ndarray], row: np.ndarray) -> None:
-        """Set a range of particles to what `read` returned, `initial` beside it, and the `row` of each in the table."""
+        """Set a range of particles from the result of `read`, extended by `initial`, and from table rows, (n)."""
         count = len(found["x"])
         rest = np.eye(self.dimension) if self.J_minus_1 is None else 1.0
         parts = (found["x"], found["v"], found["C"], found["deformation"] - rest, found["internal"])
@@ -262,7 +276,7 @@ class ParticleArrays:
             for i in ti.static(range(len(self.internal))):
                 reals[q, start + self._deformation_width + i] = self.internal[i][p]
             labels[q, 0] = self.id[p]
-            # Every entry is written: a GPU does not get the zeros of the host.
+            # Every entry is written, because a GPU does not receive the zeros of the host.
             if ti.static(self.many_bodies):
                 labels[q, 1] = self.body[p]
             else:
@@ -324,7 +338,7 @@ class ParticleArrays:
 
     @ti.func
     def seen(self, p: int):
-        """Return what the law sees of the deformation of particle p, where a frame is read."""
+        """Return the deformation that the law of particle p receives, after `to_mean` was set for a frame."""
         if ti.static(self.uses_f_bar):
             return self.stored(p) * exp(self.to_mean[p] * ti.static(1.0 / self.dimension))
         else:
@@ -350,7 +364,7 @@ class ParticleArrays:
 
     @ti.func
     def store(self, p: int, deformation: ti.template(), inner: ti.template()):
-        """Replace J or F of particle p, and its internal variables; what is unchanged of them keeps every digit."""
+        """Replace J or F of particle p and its internal variables; unchanged values keep all digits."""
         self.change(p, deformation - self.stored(p), inner)
 
     @ti.func
@@ -382,7 +396,7 @@ class ParticleArrays:
 
     @ti.func
     def place(self, p: int):
-        """Return where particle p is in the domain, m: on the CPU one may have left a periodic one since the sort."""
+        """Return the position of particle p in the domain, m; on the CPU x may be beyond a periodic face."""
         result = self.x[p]
         if ti.static(self.repeats):
             inside = self.period.inside(result)

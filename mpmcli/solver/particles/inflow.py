@@ -1,9 +1,10 @@
-"""Particles that come and go: those that wait for their emitter, and those that left through an open face.
+"""Particles that come and go: particles waiting for their emitter, and particles that left through an open face.
 
-Each has a status. The sort moves those that take part to the front of their group, so that all other loops run over
-them alone, and retires what lies beyond an open face. The particles of a sheet of an emitter lie at the mouth until it
-enters, and begin as far in front of that as they would have moved since it was due. On the CPU they then follow those
-that were sorted, and are scattered after them by one thread; on a GPU all are sorted again.
+Each particle has a status. The sort moves active particles to the front of their group, so that all other loops run
+only over these, and retires particles beyond an open face. The particles of a sheet of an emitter wait at the mouth
+until the sheet enters. They start in front of the mouth, at the distance that they would have moved since the sheet was
+due. On the CPU they then follow the sorted particles and are scattered after them by one thread; on a GPU all particles
+are sorted again.
 """
 
 from collections.abc import Sequence
@@ -16,17 +17,17 @@ from mpmcli.scene import Scene
 from mpmcli.scene.sheets import Sheets, sheets_of
 from mpmcli.solver.particles.sort import ACTIVE, BLOCKED, WAITING, entry_count
 
-# Part of the time that a layer takes to enter, after which it tries again if half of it or more finds no room.
+# Delay before a layer of which half or more is blocked tries again, as a fraction of the time in which a layer enters.
 RETRY = 0.25
 
 
 @dataclass(frozen=True)
 class Inflow:
-    """What is compiled for particles that come and go; runs for which it is equal share kernels.
+    """Compile-time constants for particles that come and go; runs with equal values share kernels.
 
     Attributes:
-        groups: of each emitter, the number of its law among those of the run.
-        cells: of the lattice of the largest mouth, an upper bound.
+        groups: per emitter, the index of its law among the laws of the run.
+        cells: upper bound of the number of cells of the lattice of a mouth.
         opens: (axis, side) of every open face.
     """
 
@@ -36,7 +37,7 @@ class Inflow:
 
     @staticmethod
     def of(scene: Scene, laws: Sequence[str]) -> "Inflow":
-        """Return those of a scene; `laws` are the names of the laws in order."""
+        """Return the constants of a scene; `laws` are the names of the laws in order."""
         groups = tuple(laws.index(emitter.material.law) for emitter in scene.emitters)
         cells = max((sheets_of(emitter, scene).mouth.filled.size for emitter in scene.emitters), default=0)
         return Inflow(groups, cells, open_faces(scene.domain.walls.faces(scene.dimension)))
@@ -51,20 +52,23 @@ def open_faces(faces: Sequence[tuple[str, str]]) -> tuple[tuple[int, int], ...]:
 
 
 def first_ids(scene: Scene, counts: Sequence[int]) -> list[int]:
-    """Return the id of the first particle of each emitter; `counts` are the particles of all sources."""
+    """Return the id of the first particle of each emitter; `counts` are the numbers of particles of all sources."""
     before = np.concatenate([[0], np.cumsum(counts)])
     return before[len(scene.bodies) : len(scene.bodies) + len(scene.emitters)].tolist()
 
 
 @ti.data_oriented
 class Emission:
-    """The mouths of all emitters of some runs on the device.
+    """Mouths of all emitters of some runs, on the device.
 
     Attributes:
-        members: of each emitter its number and that of its law.
-        ids: (runs, emitters) Vector: first id, particles of a sheet, sheets of a layer, and particles of all sheets.
-        centre: of the mouth from the origin of the domain, m; axes: rows, the first one along the flow; velocity: m/s.
-        spacing, low: of the lattice along these axes, m; cells: their number across (1 along the flow).
+        members: per emitter, its index and that of its law.
+        ids: (runs, emitters) Vector: first id, particles per sheet, sheets per layer, and particles of all sheets.
+        centre: centre of the mouth relative to the origin of the domain, m.
+        axes: axes of the mouth as rows, the first along the flow.
+        velocity: velocity of emitted particles, m/s.
+        spacing, low: spacing and lower bound of the lattice along these axes, m.
+        cells: number of cells along these axes, 1 along the flow.
         marks: (runs * emitters, cells) int, whether a cell is occupied.
     """
 
@@ -81,7 +85,7 @@ class Emission:
         self.marks = ti.field(int, shape=(runs * n, max(1, inflow.cells)))
 
     def write(self, scene: Scene, ids: Sequence[int], run: int = 0) -> list[Sheets]:
-        """Set the mouths of a run, whose emitters have these first ids; return their sheets."""
+        """Set the mouths of a run, given the first ids of its emitters; return the sheets of each."""
         found = [sheets_of(emitter, scene) for emitter in scene.emitters]
         for e, (sheets, emitter) in enumerate(zip(found, scene.emitters, strict=True)):
             mouth = sheets.mouth
@@ -101,9 +105,10 @@ class Emission:
 
     @ti.func
     def mark(self, e: ti.template(), group: ti.template(), run: int, sheet: int, late: float, p: int):
-        """Note the cell that particle p lies in, of the layer that begins with a sheet which was due `late` s ago.
+        """Mark the cell occupied by particle p, for the layer that begins with `sheet`, which was due `late` s ago.
 
-        Those of the layer before are left out, but for its first sheet: they have not come far enough yet.
+        Particles of the previous layer, except for its first sheet, are left out, because they have not moved far
+        enough yet.
         """
         if not self.is_due(e, group, run, p, ti.max(sheet - self.ids[run, e][2] + 1, 0), self.ids[run, e][2]):
             index, inside = self.cell_of(e, run, group.x[p] - late * self.velocity[run, e])
@@ -112,7 +117,7 @@ class Emission:
 
     @ti.func
     def cell_of(self, e: ti.template(), run: int, x: ti.template()):
-        """Return the cell of the mouth that a point lies in, or is nearest to, and whether it lies in that."""
+        """Return the cell of the mouth that contains a point or is nearest to it, and whether it contains the point."""
         inside, index = True, 0
         away = x - self.centre[run, e]
         axes, low, spacing, cells = self.axes[run, e], self.low[run, e], self.spacing[run, e], self.cells[run, e]
@@ -132,18 +137,18 @@ class Emission:
 
     @ti.func
     def particles_of(self, e: ti.template(), run: int, sheet: int, sheets: int):
-        """Return how many particles some sheets of an emitter have."""
+        """Return the number of particles of `sheets` sheets of an emitter from `sheet` on."""
         return ti.min((sheet + sheets) * self.ids[run, e][1], self.ids[run, e][3]) - sheet * self.ids[run, e][1]
 
     @ti.func
     def is_due(self, e: ti.template(), group: ti.template(), run: int, p: int, sheet: int, sheets: int):
-        """Return whether particle p of a group belongs to some sheets of an emitter."""
+        """Return whether particle p of a group belongs to one of `sheets` sheets of an emitter from `sheet` on."""
         q = group.id[p] - self.ids[run, e][0] - sheet * self.ids[run, e][1]
         return q >= 0 and q < self.particles_of(e, run, sheet, sheets)
 
     @ti.func
     def keeps_out(self, e: ti.template(), group: ti.template(), run: int, p: int, sheet: int):
-        """Return whether particle p belongs to the layer that begins with a sheet, and its cell is occupied."""
+        """Return whether particle p belongs to the layer that begins with `sheet` and its cell is occupied."""
         result = self.is_due(e, group, run, p, sheet, self.ids[run, e][2])
         if result:
             index, _ = self.cell_of(e, run, group.x[p])
@@ -152,7 +157,7 @@ class Emission:
 
     @ti.func
     def count_blocked(self, e: ti.template(), group: ti.template(), run: int, sheet: int, active: int, after: int):
-        """Return how many particles of the layer that begins with a sheet find no room; see `enter`."""
+        """Return the number of blocked particles of the layer that begins with `sheet`; see `enter`."""
         blocked, seen, p = 0, 0, active
         size = self.particles_of(e, run, sheet, self.ids[run, e][2])
         while p < after and seen < size:
@@ -164,14 +169,14 @@ class Emission:
 
     @ti.func
     def keep_out(self, e: ti.template(), group: ti.template(), run: int, sheet: int, active: int, after: int):
-        """Keep those out for good."""
+        """Block the particles of the layer that begins with `sheet` whose cells are occupied, permanently."""
         for p in range(active, after):
             if self.keeps_out(e, group, run, p, sheet):
                 group.activity[p] = BLOCKED
 
     @ti.func
     def begin(self, e: ti.template(), group: ti.template(), run: int, p: int, late: float):
-        """Let particle p take part, of a sheet that was due `late` s ago."""
+        """Activate particle p of a sheet that was due `late` s ago."""
         group.activity[p] = ACTIVE
         velocity = self.velocity[run, e]
         for c in ti.static(range(self.dimension)):
@@ -180,9 +185,13 @@ class Emission:
 
     @ti.func
     def enter(self, e: ti.template(), group: ti.template(), run: int, sheet: int, late: float, active: int, after: int):
-        """Let what waits of a sheet enter behind those that take part; return where these end now; on one thread.
+        """Activate the waiting particles of a sheet, after the active ones, on one thread; return the new end of these.
 
-        active: where they ended; after: the first particle that is not of this run.
+        Args:
+            sheet: the sheet.
+            late: time since it was due, s.
+            active: end of the active particles before.
+            after: the first particle after those of this run.
         """
         end, p, seen = active, active, 0
         size = self.particles_of(e, run, sheet, 1)

@@ -1,8 +1,8 @@
-"""Keeps the particles of a group sorted by tile, so that neighbours in space are neighbours in memory.
+"""Sorts the particles of a group by tile, so that neighbours in space are neighbours in memory.
 
-On the CPU the tiles also make the scatter safe without atomics: tiles form pencils along the last axis,
-pencils are coloured along the others, and pencils of one colour write disjoint nodes. The sort is a stable counting
-sort, a share of the particles for each thread, so the order, and with it every floating-point sum, is the same for any
+On the CPU the tiles also make the scatter safe without atomics: tiles form pencils along the last axis, pencils are
+coloured along the other axes, and pencils of one colour write disjoint nodes. The sort is a stable counting sort with a
+share of the particles per thread. The order of particles, and hence every floating-point sum, is the same for any
 number of threads (docs/theory.md, 8).
 """
 
@@ -12,7 +12,7 @@ from mpmcli.quick_taichi import ti
 from mpmcli.solver.grid.grid import Grid
 from mpmcli.solver.particles.arrays import ParticleArrays
 
-# Whether a particle waits, takes part, has left, or stays out for good.
+# Status of a particle: waiting for its emitter, active, retired beyond an open face, or permanently blocked.
 WAITING, ACTIVE, RETIRED, BLOCKED = range(4)
 # Taichi gives a CPU thread at least this many iterations of a parallel loop.
 CHUNK = 512
@@ -22,7 +22,7 @@ SPAN = 256
 
 @ti.func
 def share_start(count: int, t: int, threads: int):
-    """Return where the t-th of nearly equal shares of `count` items begins; count * t would overflow."""
+    """Return the start of the t-th of nearly equal shares of `count` items, without the overflow of count * t."""
     return count // threads * t + ti.min(t, count % threads)
 
 
@@ -36,10 +36,10 @@ class SortBuffers:
 
     Attributes:
         capacity: particles of the largest group of one run.
-        order: (n) int, where the particle at each new place comes from.
-        key: (n) int, tile of each particle; also the scratch of integer fields.
-        real: (n w) scratch of real fields; widest: w, the largest number of entries of a particle in one of them, or
-            that of groups: between sorts it holds a number of each particle.
+        order: (n) int, the old index of the particle at each new index.
+        key: (n) int, tile of each particle; also scratch memory for integer fields.
+        real: (n w) scratch memory for real fields; between sorts it stores one number per particle.
+        widest: w, the largest number of entries per particle of a real field, at least the number of groups.
     """
 
     def __init__(self, groups: Sequence[ParticleArrays], runs: int = 1) -> None:
@@ -53,9 +53,12 @@ class SortBuffers:
 
 @ti.func
 def scratch_offset(buffers: ti.template(), g: ti.template(), w: int, capacity: ti.template()):
-    """Return what to add to the number of a particle for a place in `SortBuffers.real` that no other has.
+    """Return the offset from the index of a particle to its own entry in `SortBuffers.real`.
 
-    g: its group; w: its run; capacity: particles of a run in the group.
+    Args:
+        g: group of the particle.
+        w: run of the particle.
+        capacity: particles of a run in the group.
     """
     return w * ti.static(buffers.capacity * buffers.widest - capacity) + ti.static(g * buffers.capacity)
 
@@ -65,15 +68,16 @@ class TileOrder:
     """The tile order of one group.
 
     Attributes:
-        start: (bins + 1) int, first particle of each bin: the tiles, and see `bin_of`.
-        first_tile: place in `start` of tile 0.
-        work: (colours, threads + 1) int, first pencil of a colour of each thread.
+        start: (bins + 1) int, first particle of each bin; for the bins see `bin_of`.
+        first_tile: index of tile 0 in `start`.
+        work: (colours, threads + 1) int, first pencil of each thread per colour.
     """
 
     def __init__(self, group: ParticleArrays, grid: Grid, buffers: SortBuffers, threads: int, runs: int = 1) -> None:
         self.group, self.grid, self.buffers, self.threads = group, grid, buffers, threads
         self.tiles = grid.tile_count
-        # Behind the tiles, where particles come and go, one bin of those that wait and one of those that left.
+        # If particles come and go, the tiles are followed by a bin of waiting and blocked particles and a bin of
+        # retired ones.
         self.comes_and_goes = group.comes_and_goes
         self.bins = self.tiles + 2 * self.comes_and_goes
         self.extent = tuple(n * grid.spacing for n in grid.cells)
@@ -87,7 +91,7 @@ class TileOrder:
 
     @staticmethod
     def bytes_needed(tiles: int, threads: int) -> int:
-        """Return the bytes that the tables of one group take for so many tiles."""
+        """Return the bytes of the tables of one group for this number of tiles."""
         return 4 * tiles * (threads + 1)
 
     @ti.func
@@ -97,7 +101,7 @@ class TileOrder:
 
     @ti.func
     def wrap(self, p: int):
-        """Put particle p back into the domain where that repeats."""
+        """Wrap particle p into a periodic domain."""
         if ti.static(len(self.grid.period.axes) > 0):
             self.grid.period.wrap(self.group, p)
 
@@ -107,7 +111,7 @@ class TileOrder:
 
     @ti.func
     def status_of(self, p: int):
-        """Return the status of particle p; what lies beyond an open face is retired."""
+        """Return the status of particle p; an active particle beyond an open face is retired first."""
         status = ACTIVE
         if ti.static(self.comes_and_goes):
             status = self.group.activity[p]
@@ -129,7 +133,7 @@ class TileOrder:
 
     @ti.func
     def bin_of(self, p: int):
-        """Return the bin of particle p, its tile if it takes part."""
+        """Return the bin of particle p: its tile if it is active, otherwise one of the bins after the tiles."""
         place = 0
         if ti.static(self.comes_and_goes):
             status = self.status_of(p)
@@ -143,7 +147,7 @@ class TileOrder:
 
     @ti.func
     def pencils_along(self, colour: int, axis: ti.template()):
-        """Return how many pencils of a colour lie along an axis; bit `axis` of the colour is their parity."""
+        """Return the number of pencils of a colour along an axis; bit `axis` of the colour is their parity."""
         return (self.grid.tiles[axis] - (colour >> axis & 1) + 1) // 2
 
     @ti.func
@@ -155,7 +159,7 @@ class TileOrder:
 
     @ti.func
     def pencil_of(self, colour: int, q: int):
-        """Return the number of the q-th pencil of a colour, among all pencils."""
+        """Return the index, among all pencils, of the q-th pencil of a colour."""
         place = ti.Vector.zero(int, ti.static(self.grid.dimension - 1))
         rest = q
         for b in ti.static(range(self.grid.dimension - 1)):
@@ -174,21 +178,21 @@ class TileOrder:
 
     @ti.func
     def first_tile_of(self, pencil: int):
-        """Return the first tile of a pencil, or behind the last pencil the number of tiles."""
+        """Return the first tile of a pencil; after the last pencil, the number of tiles."""
         return pencil * ti.static(self.grid.tiles[-1])
 
     @ti.func
     def first_particle_of(self, pencil: int):
-        """Return the first particle of a pencil; behind the last pencil, the one after the last."""
+        """Return the first particle of a pencil; after the last pencil, the index after the last particle."""
         return self.start[self.first_tile + self.first_tile_of(pencil)]
 
 
 @ti.func
 def stay_rolled(scratch: ti.template(), index: int):
-    """Keep LLVM from unrolling the loop around on the CPU, for an index that is never negative, as LLVM does not know.
+    """Prevent LLVM on the CPU from unrolling the enclosing loop; `index` is never negative, which LLVM does not know.
 
-    A call that is never made is enough. Loops that copy or sum gain nothing by it, and the time to compile them grows
-    with the square of their length.
+    A call that is never executed suffices. Loops that copy or sum do not profit from unrolling, and their compile time
+    grows with the square of their length.
     """
     if index < 0:
         scratch[0] = ti.cast(ti.acos(ti.cast(index, float)), scratch.dtype)
@@ -196,7 +200,7 @@ def stay_rolled(scratch: ti.template(), index: int):
 
 @ti.func
 def count_tiles(order: ti.template(), run: int, t: int, first: int, begin: int, end: int):
-    """Count the particles of each tile in share t of those of a run, which begin at `first`: from `begin` to `end`."""
+    """Count particles per tile in share t of a run, `begin` to `end` - 1 relative to `first`, the first of the run."""
     cursor, own = run * ti.static(order.bins), run * ti.static(order.buffers.capacity)
     for tile in range(order.bins):
         stay_rolled(order.buffers.real, cursor + tile)
@@ -211,7 +215,7 @@ def count_tiles(order: ti.template(), run: int, t: int, first: int, begin: int, 
 
 @ti.func
 def find_places(order: ti.template(), run: int, first: int):
-    """Set the first particle of each tile of a run, and where each share places its particles of the tile."""
+    """Set the first particle of each tile of a run, and the first index of each share in each tile."""
     cursor, place = run * ti.static(order.bins), 0
     for tile in range(order.bins):
         stay_rolled(order.buffers.real, place)
@@ -225,7 +229,7 @@ def find_places(order: ti.template(), run: int, first: int):
 
 @ti.func
 def place_particles(order: ti.template(), run: int, t: int, first: int, begin: int, end: int):
-    """Note, at the place of each particle of a share, where it comes from; see `count_tiles`."""
+    """Store the old index of each particle of a share at its new index; see `count_tiles`."""
     cursor, own = run * ti.static(order.bins), run * ti.static(order.buffers.capacity)
     for q in range(begin, end):
         tile = cursor + order.buffers.key[own + q]
@@ -240,7 +244,7 @@ def is_label(field: ti.Field) -> bool:
 
 @ti.func
 def keep(buffers: ti.template(), field: ti.template(), first: int, q: int, source: int):
-    """Copy the entries of one particle to place q of a buffer; `first` is that of the first particle of its run."""
+    """Copy the entries of particle `source` to entry q of a run in a buffer; `first` is the first entry of the run."""
     entries = ti.static(entry_count(field))
     value = field[source]
     if ti.static(is_label(field)):
@@ -268,7 +272,7 @@ def take(buffers: ti.template(), field: ti.template(), first: int, q: int, p: in
 
 @ti.func
 def keep_all(buffers: ti.template(), field: ti.template(), own: int, begin: int, end: int):
-    """Copy the entries of the particles that come to places begin to end - 1 of a run, on the CPU."""
+    """Copy the entries of the particles with new indices begin to end - 1 of a run, on the CPU."""
     for q in range(begin, end):
         stay_rolled(buffers.real, q)
         keep(buffers, field, own, q, buffers.order[own + q])

@@ -1,4 +1,4 @@
-"""Measures extreme values over the particles of each law, on which the limits of the next steps depend."""
+"""Measures extreme values over the particles of each law, which determine the limits of the next steps."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from mpmcli.scene import Scene, highest_speed
 from mpmcli.solver.machine.backend import Backend
 from mpmcli.solver.particles.sort import CHUNK, share_start
 
-# Minima are stored as maxima of the negative.
+# Minima are stored as maxima of negated values.
 SPEED_SQUARED, RATE, J_MAX, MINUS_J_MIN, STRETCH_SQUARED = range(5)
 ENTRIES = 5
 NOTHING = -1e30
@@ -36,7 +36,7 @@ class StateBounds:
 
 @ti.func
 def volume_ratio(group: ti.template(), deformation: ti.template()):
-    """Return J of a particle's deformation, which may be padded beyond d x d."""
+    """Return J of the deformation of a particle, which may be padded beyond d x d."""
     J = 1.0
     if ti.static(group.law.deformation == "F"):
         F = ti.Matrix.zero(float, group.dimension, group.dimension)
@@ -50,7 +50,7 @@ def volume_ratio(group: ti.template(), deformation: ti.template()):
 
 @ti.func
 def row_sum(matrix: ti.template()):
-    """Return the largest sum of absolute entries in a row: a bound on every eigenvalue (Gershgorin)."""
+    """Return the largest row sum of absolute entries, a bound on every eigenvalue (Gershgorin)."""
     largest = 0.0
     for i in ti.static(range(matrix.n)):
         row = 0.0
@@ -71,7 +71,7 @@ def second_invariant(C: ti.template()):
 
 @ti.func
 def volume_growth(C: ti.template(), dt: float):
-    """Return det(I + dt C) - 1, by which J grows in a step."""
+    """Return det(I + dt C) - 1, the relative growth of J in a step."""
     growth = dt * (C.trace() + dt * second_invariant(C))
     if ti.static(C.n == 3):
         growth += dt * dt * dt * C.determinant()
@@ -82,12 +82,12 @@ def volume_growth(C: ti.template(), dt: float):
 def deformation_rate(group: ti.template(), C: ti.template()):
     """Return a bound on the rate at which C changes the stored deformation, 1/s: the row sum of |C + C^T| / 2 for F.
 
-    Rotation does not count: |(I + dt C) a| >= (1 - dt |D|) |a|, D the symmetric part of C. For J it is |tr C| +
-    sqrt(-m), m the second invariant of C where it is negative: det(I + dt C) = 1 + dt tr C + dt^2 m + ...
+    Rotation does not count: |(I + dt C) a| >= (1 - dt |D|) |a|, with D the symmetric part of C. For J it is |tr C| +
+    sqrt(-m), with m the second invariant of C, if negative: det(I + dt C) = 1 + dt tr C + dt^2 m + ...
     """
     rate = 0.0
     if ti.static(group.law.deformation == "F"):
-        # Entry by entry: half the time of row_sum(C + C.transpose()).
+        # Entry by entry, which takes half the time of row_sum(C + C.transpose()).
         for i in ti.static(range(C.n)):
             row = 0.0
             for j in ti.static(range(C.n)):
@@ -100,13 +100,13 @@ def deformation_rate(group: ti.template(), C: ti.template()):
 
 
 def entries(group: object) -> int:
-    """Return the number of maxima that `widen_motion` and `widen_state` raise."""
+    """Return the number of maxima that `widen_motion` and `widen_state` update."""
     return ENTRIES + 2 * len(group.internal)
 
 
 @ti.func
 def widen_motion(own: ti.template(), v: ti.template(), rate: float):
-    """Raise maxima to those of a particle that moves by v, m/s, and deforms at this rate, 1/s."""
+    """Update maxima with a particle of velocity v, m/s, and rate of deformation `rate`, 1/s."""
     own[SPEED_SQUARED] = ti.max(own[SPEED_SQUARED], v.norm_sqr())
     own[RATE] = ti.max(own[RATE], rate)
 
@@ -118,7 +118,7 @@ def widen_state(group: ti.template(), own: ti.template(), p: int):
     own[J_MAX] = ti.max(own[J_MAX], J)
     own[MINUS_J_MIN] = ti.max(own[MINUS_J_MIN], -J)
     if ti.static(group.law.deformation == "F"):
-        # The largest eigenvalue of b = F F^T, exact at rest in any rotation.
+        # Bound on the largest eigenvalue of b = F F^T, exact at rest in any rotation.
         b = deformation @ deformation.transpose()
         own[STRETCH_SQUARED] = ti.max(own[STRETCH_SQUARED], row_sum(b))
     else:
@@ -130,7 +130,7 @@ def widen_state(group: ti.template(), own: ti.template(), p: int):
 
 
 def state_bounds_of(group: object, maxima: Sequence[float]) -> StateBounds:
-    """Return the bounds that these maxima represent, what may come in included."""
+    """Return the bounds that these maxima represent, including particles that may enter."""
     if group.floor is not None:
         maxima = np.maximum(maxima, group.floor).tolist()
     values = maxima[ENTRIES:]
@@ -140,7 +140,7 @@ def state_bounds_of(group: object, maxima: Sequence[float]) -> StateBounds:
 
 
 def floor_of(scene: Scene, law: Law, members: Sequence[int]) -> np.ndarray | None:
-    """Return the maxima of the particles at rest that may come in, as fast as its emitters; None if none come or go."""
+    """Return maxima for undeformed particles at the speed of the emitters; None without emitters and open faces."""
     if not scene.comes_and_goes:
         return None
     speeds = [highest_speed(scene.sources[i]) for i in members if i >= len(scene.bodies)]
@@ -149,15 +149,16 @@ def floor_of(scene: Scene, law: Law, members: Sequence[int]) -> np.ndarray | Non
 
 
 def build_maxima(size: int, widen: Callable, backend: Backend) -> Callable[[int, int, int], list[float]]:
-    """Return a reduction over particles of a run, from the first one, their number, and that of the run.
+    """Return a reduction over the particles of a run; its arguments are the first particle, their number, and the run.
 
-    `widen` (own, p, run) raises the maxima `own` to those of particle p.
+    `widen(own, p, run)` updates the maxima `own` with particle p.
     """
     if size == 0:
         return lambda first, count, run: []
     vector = ti.types.vector(size, float)
     found = ti.field(float, shape=size)
-    # Each worker keeps its own maxima and merges them once: an atomic per particle takes longer than everything else.
+    # Each worker keeps its own maxima and merges them once, because an atomic per particle takes longer than everything
+    # else.
     workers = CHUNK * backend.threads if backend.on_cpu else GPU_WORKERS
     on_cpu = backend.on_cpu
 

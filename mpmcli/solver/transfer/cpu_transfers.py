@@ -1,8 +1,8 @@
-"""P2G and G2P on the CPU, LANES particles at once: see `lanes`. What is added to nodes follows particle by particle.
+"""P2G and G2P on the CPU, LANES particles at a time (see `lanes`). Additions to nodes are particle by particle.
 
-At the end the loops of a step over a share of the nodes or of the particles, as one thread runs them; `at` is a `Part`.
-On a sparse grid particles are scattered and gathered tile by tile, in the window of the thread, and a window is added
-to the blocks as a whole: so are the sums of a node those of tiles, in their order, for any number of threads.
+The last functions are the loops of a step over the nodes or particles of one thread; `at` is a `Part`. On a sparse grid
+particles are scattered and gathered tile by tile in the window of the thread, and a window is added to the blocks as a
+whole. The sum of a node is therefore a sum over tiles in fixed order, for any number of threads.
 """
 
 from mpmcli.quick_taichi import ti
@@ -44,13 +44,13 @@ from mpmcli.solver.transfer.volume import average_range, missing_growth
 def scatter_range(
     particles: ti.template(), g: ti.template(), group: ti.template(), first: int, last: int, kick: float, relaxed: float
 ):
-    """Scatter particles first to last - 1 of the g-th group; no other thread may write their nodes."""
+    """Scatter particles first to last - 1 of the g-th group; no other thread may write to their nodes."""
     grid, near = ti.static((particles.grid, particles.near))
     d = ti.static(group.dimension)
     width = ti.static(grid.width)
     nodes = ti.static(grid.scheme.spline.nodes)
     inners = ti.static(internal_entries(group))
-    # Places on the grid, and where particles are, if that is not the same.
+    # Positions on the grid, and positions in the domain where they differ.
     places, heres = zero_lanes(d), zero_lanes(ti.static(d if group.total else 1))
     speeds, affine = zero_lanes(d), zero_lanes(ti.static(d * d))
     deformation, internal = zero_lanes(ti.static(stored_entries(group))), zero_lanes(inners)
@@ -88,7 +88,7 @@ def scatter_range(
             repeat_first(heres, count)
         load_layers(behind, grid, group, begin, count)
         for lane in range(ti.static(LANES * loaded)):
-            # What reads more than arrays: lanes beyond the last particle repeat it.
+            # Loads read tables by particle, so that lanes beyond the last particle repeat it.
             p = begin + ti.min(lane, count - 1)
             share, lacking, push, slope, touch, friction = loads_on(particles, g, group, p, kick, lane < count)
             shares[lane], missing[lane] = share, lacking
@@ -129,7 +129,7 @@ def scatter_range(
             store_projected(group, begin, count, deformation, internal, ratios)
         for lane in range(count):
             p = begin + lane
-            # The stress of a particle that is crushed or inverted would spread NaN over the grid.
+            # The stress of a crushed or inverted particle would spread NaN over the grid.
             if ratios[lane] > SMALLEST_J:
                 w = weights_of(weights, nodes, d, lane)
                 middle = node_values_of(middles, 0, width, lane)
@@ -152,14 +152,14 @@ def store_projected(
     internal: ti.template(),
     ratios: ti.template(),
 ):
-    """Store the states that a law has projected, but not those of particles that are crushed or inverted."""
+    """Store the states that a law has projected, except those of crushed or inverted particles."""
     d = ti.static(group.dimension)
     keeps_F = ti.static(group.law.deformation == "F")
     sound = 0
     for lane in range(LANES):
         sound += ti.cast(ratios[lane] > SMALLEST_J, int)
     if count == LANES and sound == LANES:
-        # Entry by entry: those of neighbouring particles are stored at once.
+        # Entry by entry, so that entries of neighbouring particles are stored at once.
         origin = bounded(begin)
         if ti.static(keeps_F):
             for i, j in ti.static(ti.ndrange(d, d)):
@@ -203,7 +203,7 @@ def advance_range(
     first_node, behind = ti.Vector.zero(int, LANES), ti.Vector.zero(int, LANES)
     weights = zero_lanes(ti.static(nodes * d))
     velocities, moments = ti.Matrix.zero(float, LANES, width), ti.Matrix.zero(float, LANES, ti.static(d * width))
-    # Of particles whose body keeps a share of its motion.
+    # For particles whose body keeps a fraction of its motion.
     keeps = ti.static(grid.scheme.keeps_flip_velocity)
     kept = ti.static(grid.kept if keeps else 0)
     own_speeds, own_affine = zero_lanes(ti.static(d if keeps else 1)), zero_lanes(ti.static(d * d if keeps else 1))
@@ -281,13 +281,14 @@ def advance_range(
             set_deformation(group, after, state, lane)
             beyond[lane], growths[0, lane], rates[lane] = out, growth, rate
 
-        # Written so that a NaN is not sound; then it stays, and no later step writes outside the grid.
+        # Written so that a NaN is not sound: the particle then does not move, and no later step writes outside the
+        # grid.
         sound = count
         for lane in range(count):
             sound -= ti.cast(beyond[lane] <= 0.5 * grid.spacing, int)
             sharpest = ti.max(sharpest, rates[lane])
         if count == LANES and sound == 0:
-            # Entry by entry: those of neighbouring particles are stored at once.
+            # Entry by entry, so that entries of neighbouring particles are stored at once.
             for c in ti.static(range(d)):
                 store_lanes(group.x, (c,), origin, moved, c)
                 store_lanes(group.v, (c,), origin, speeds, c)
@@ -379,9 +380,9 @@ def advance_tiles(at: ti.template(), first: int, after: int, dt: float, gravity_
 
 @ti.func
 def update_rows(at: ti.template(), first: int, last: int, gravity_step: ti.template(), meets: ti.template()):
-    """Update the nodes in rows first to last - 1 of the box in use; return the square of the largest velocity.
+    """Update the nodes in rows first to last - 1 of the box in use; return the largest squared speed.
 
-    `meets` is as of `NodeUpdate.update`.
+    For `meets` see `NodeUpdate.update`.
     """
     d = ti.static(at.grid.dimension)
     speed_squared = 0.0
@@ -392,7 +393,7 @@ def update_rows(at: ti.template(), first: int, last: int, gravity_step: ti.templ
             nodes *= at.nodes.rigid.near(node, d - 1)
         for k in range(nodes):
             squared = at.nodes.update(node, index + k, gravity_step, meets)
-            # Not `ti.max`, which takes twice as long for its care of NaN, at every node without mass.
+            # Not `ti.max`: its handling of NaN takes twice as long, at every node without mass.
             if squared > speed_squared:
                 speed_squared = squared
             node[d - 1] += 1
@@ -401,7 +402,7 @@ def update_rows(at: ti.template(), first: int, last: int, gravity_step: ti.templ
 
 @ti.func
 def nodes_of_rows(at: ti.template(), first: int, last: int, kick: float):
-    """Do what a phase says for each node in rows first to last - 1 of the box in use."""
+    """Apply the function of a phase to each node in rows first to last - 1 of the box in use."""
     for row in range(first, last):
         node = at.grid.row_start(row)
         for _ in range(at.grid.row_length(node)):
@@ -411,7 +412,7 @@ def nodes_of_rows(at: ti.template(), first: int, last: int, kick: float):
 
 @ti.func
 def nodes_of_blocks(at: ti.template(), first: int, after: int, kick: float):
-    """Do what a phase says for each node of blocks `first` to `after` - 1."""
+    """Apply the function of a phase to each node of blocks `first` to `after` - 1."""
     grid, d = ti.static((at.grid, at.grid.dimension))
     for b in range(first, after):
         node = grid.tile_place(grid.tile_at[b])
@@ -425,7 +426,7 @@ def nodes_of_blocks(at: ti.template(), first: int, after: int, kick: float):
 
 @ti.func
 def update_blocks(at: ti.template(), first: int, after: int, gravity_step: ti.template(), meets: ti.template()):
-    """Update the nodes of blocks `first` to `after` - 1 in the box; return the square of the largest velocity."""
+    """Update the nodes of blocks `first` to `after` - 1 in the box; return the largest squared speed."""
     grid, d = ti.static((at.grid, at.grid.dimension))
     speed_squared = 0.0
     for b in range(first, after):
@@ -438,7 +439,7 @@ def update_blocks(at: ti.template(), first: int, after: int, gravity_step: ti.te
                 inside = inside and node[a] >= grid.box[0, a] and node[a] < grid.box[0, a] + grid.box[1, a]
             if inside:
                 squared = at.nodes.update(node, b * ti.static(grid.block) + q, gravity_step, meets)
-                # As in `update_rows`.
+                # Not `ti.max`, see `update_rows`.
                 if squared > speed_squared:
                     speed_squared = squared
     return speed_squared

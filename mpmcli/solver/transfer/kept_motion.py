@@ -1,8 +1,8 @@
-"""Relaxed APIC: bodies keep a share of what the nodes do not see of their motion in steps shorter than their own.
+"""Relaxed APIC: in steps shorter than its own step, a body keeps a fraction of the motion that nodes do not resolve.
 
-APIC damps all of it in each step, whatever its length. Where a step is shorter than a body needs, since another body, a
-setting or a frame asks for it, the body keeps a share, so that it loses as much in a second as in steps of its own
-(docs/theory.md, 2.3).
+APIC removes all of this motion in each step, whatever its length. If another body, a setting or a frame makes a step
+shorter than a body requires, the body keeps a fraction, so that it loses as much per second as in steps of its own
+length (docs/theory.md, 2.3).
 """
 
 import math
@@ -15,14 +15,14 @@ from mpmcli.scene.schema import Body, Emitter
 from mpmcli.stability.limits import collider_limit, mode_limit, speed_limit
 from mpmcli.stability.transfer_factors import step_inertia
 
-# The step of its own that a body is damped for, over the bound that it sets by itself: that of time.safety by default.
+# The own step of a body divided by the bound that the body alone sets: the default of time.safety.
 OWN_STEP = 0.8
-# Steps from this share of it on damp as a whole one.
+# Steps from this fraction of the own step on count as a whole one.
 NEAR = 0.8
 
 
 def keeps_motion(scene: Scene, members: Sequence[Law]) -> bool:
-    """Return whether any body of a scene keeps a share of its motion, by what is known before the run."""
+    """Return whether any body of a scene keeps a fraction of its motion, as estimated before the run."""
     time, h = scene.time, scene.domain.spacing
     if scene.solver.flip:
         return True
@@ -35,7 +35,7 @@ def keeps_motion(scene: Scene, members: Sequence[Law]) -> bool:
 
 
 def own_limit(source: Body | Emitter, law: Law, scene: Scene) -> float:
-    """Return the step that a source of particles allows at the start, s."""
+    """Return the stable step of a source of particles at the start, s."""
     material, h, inertia = source.material, scene.domain.spacing, step_inertia(scene.solver)
     modes = law.reference_modes if scene.solver.solids == "total" else law.modes
     found = modes(material, StateBound())
@@ -45,9 +45,9 @@ def own_limit(source: Body | Emitter, law: Law, scene: Scene) -> float:
 
 @ti.pyfunc
 def kept_share(ratio: ti.template(), damped: ti.template()):
-    """Return the share that a body keeps in a step, given that step over the bound that the body sets itself.
+    """Return the fraction that a body keeps in a step, given the ratio of the step to the bound set by the body.
 
-    damped: the share that is lost in a step of its own: 1 with APIC.
+    `damped` is the fraction lost in a step of its own length; 1 with APIC.
     """
     lost = ratio / OWN_STEP
     if ratio > NEAR * OWN_STEP:

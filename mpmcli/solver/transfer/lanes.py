@@ -1,10 +1,11 @@
-"""What particles store, for LANES of them at once on the CPU, so that a compiler makes vector instructions.
+"""Particle state for LANES particles at a time on the CPU, so that the compiler vectorises loops.
 
-A loop over lanes becomes vector instructions, branches included, where it reads and writes local arrays alone and calls
-nothing. One that stores to fields does not, as Taichi reads the address of a field anew after every store. Therefore
-particles are copied to local arrays with a row for each quantity and a column for each lane, by loops for each entry,
-short enough for the compiler to copy all lanes at once. Every lane computes what it would compute alone. Lanes beyond
-the last particle of a range repeat the first one: what they compute is not used, but laws may loop until they converge.
+The compiler vectorises a loop over lanes, including its branches, if the loop accesses only local arrays and calls no
+functions. It does not vectorise a loop that stores to fields, because Taichi reloads the address of a field after every
+store. Therefore particles are copied to local arrays with a row per quantity and a column per lane, by one short loop
+per entry, so that the compiler copies all lanes at once. Each lane computes the same result as a particle alone. Lanes
+beyond the last particle of a range repeat the first one: their results are not used, but laws may iterate until
+convergence.
 """
 
 from mpmcli.quick_taichi import ti
@@ -16,7 +17,7 @@ LANES = 8
 
 @ti.func
 def repeat_first(lanes: ti.template(), count: int):
-    """Copy lane 0 to the lanes from `count` on, which were loaded from what follows in memory."""
+    """Copy lane 0 to the lanes from `count` on, which were loaded from memory beyond the last particle."""
     for lane in range(count, LANES):
         for k in ti.static(range(lanes.n)):
             lanes[k, lane] = lanes[k, 0]
@@ -28,12 +29,12 @@ def zero_lanes(rows: ti.template()):
 
 
 def stored_entries(group: object) -> int:
-    """Return the numbers of what a particle stores of its deformation."""
+    """Return how many numbers a particle stores for its deformation."""
     return group.dimension**2 if group.law.deformation == "F" else 1
 
 
 def internal_entries(group: object) -> int:
-    """Return the numbers that `ParticleArrays.inner` returns."""
+    """Return the length of the vector that `ParticleArrays.inner` returns."""
     return max(len(group.internal), 1)
 
 
@@ -41,7 +42,7 @@ def internal_entries(group: object) -> int:
 def load_lanes(
     group: ti.template(), begin: int, count: int, C: ti.template(), stored: ti.template(), inner: ti.template()
 ):
-    """Copy C, what is stored of the deformation, and the internal variables of `count` particles from `begin` on."""
+    """Copy C, the stored deformation and the internal variables of `count` particles from `begin` on."""
     d = ti.static(group.dimension)
     origin = bounded(begin)
     for c, a in ti.static(ti.ndrange(d, d)):
@@ -68,14 +69,14 @@ def load_deformation(group: ti.template(), origin: int, deformation: ti.template
 
 @ti.func
 def load_vectors(lanes: ti.template(), field: ti.template(), origin: int):
-    """Copy the vectors of the particles from `origin` on, as many entries as there are rows."""
+    """Copy the vectors of the particles from `origin` on, one entry per row."""
     for c in ti.static(range(lanes.n)):
         load_entry(lanes, c, field, (c,), origin)
 
 
 @ti.func
 def load_entry(lanes: ti.template(), k: ti.template(), field: ti.template(), entry: ti.template(), origin: int):
-    """Copy an entry of the particles from `origin` on to row k of an array: all are read before one is written."""
+    """Copy an entry of the particles from `origin` on to row k of an array; all are read before any is written."""
     row = ti.Vector.zero(float, LANES)
     for lane in range(LANES):
         if ti.static(len(entry) == 0):
@@ -88,7 +89,7 @@ def load_entry(lanes: ti.template(), k: ti.template(), field: ti.template(), ent
 
 @ti.func
 def store_lanes(field: ti.template(), entry: ti.template(), origin: int, lanes: ti.template(), k: ti.template()):
-    """Store row k of an array of lanes as an entry of particles from `origin` on; all are read before one is stored."""
+    """Store row k of an array of lanes as an entry of particles from `origin` on; all are read before any is stored."""
     row = ti.Vector.zero(float, LANES)
     for lane in range(LANES):
         row[lane] = lanes[k, lane]
@@ -101,9 +102,9 @@ def store_lanes(field: ti.template(), entry: ti.template(), origin: int, lanes: 
 
 @ti.func
 def load_rows(group: ti.template(), begin: int, count: int, rows: ti.template()):
-    """Copy the rows of the table that `count` particles from `begin` on read; of one body all lanes have the same."""
+    """Copy the table rows of `count` particles from `begin` on; with one body all lanes have the same row."""
     for lane in range(LANES):
-        # What lies beyond the last particle is no row of the table.
+        # Memory beyond the last particle holds no row number of the table.
         row = group.row(begin + ti.min(lane, count - 1))
         for k in ti.static(range(row.n)):
             rows[k, lane] = row[k]
@@ -111,16 +112,16 @@ def load_rows(group: ti.template(), begin: int, count: int, rows: ti.template())
 
 @ti.func
 def load_layers(behind: ti.template(), grid: ti.template(), group: ti.template(), begin: int, count: int):
-    """Find how far behind those of layer 0 the nodes of `count` particles from `begin` on lie."""
+    """Set `behind` to the index offsets, from layer 0, of the nodes of `count` particles from `begin` on."""
     if ti.static(group.layers > 1):
         for lane in range(LANES):
-            # What lies beyond the last particle is no row of the table.
+            # Memory beyond the last particle holds no row number of the table.
             behind[lane] = group.layer_of(begin + ti.min(lane, count - 1)) * ti.static(grid.node_count)
 
 
 @ti.func
 def matrix_of(lanes: ti.template(), first: ti.template(), d: ti.template(), lane: int):
-    """Return a d x d matrix of a lane, of the rows from `first` on; zero where there are none."""
+    """Return a d x d matrix of a lane from the rows from `first` on; zero if there are no such rows."""
     result = ti.Matrix.zero(float, d, d)
     if ti.static(first + d * d <= lanes.n):
         for i, j in ti.static(ti.ndrange(d, d)):
@@ -130,7 +131,7 @@ def matrix_of(lanes: ti.template(), first: ti.template(), d: ti.template(), lane
 
 @ti.func
 def vector_of(lanes: ti.template(), first: ti.template(), size: ti.template(), lane: int):
-    """Return some entries of a lane, from row `first` on; zero where there are none."""
+    """Return `size` entries of a lane from row `first` on; zero if there are no such rows."""
     result = ti.Vector.zero(float, size)
     if ti.static(first + size <= lanes.n):
         for i in ti.static(range(size)):
@@ -156,7 +157,7 @@ def set_matrix(lanes: ti.template(), first: ti.template(), matrix: ti.template()
 
 @ti.func
 def set_deformation(group: ti.template(), lanes: ti.template(), deformation: ti.template(), lane: int):
-    """Set J - 1, or F - I, of a lane."""
+    """Set J - 1 or F - I of a lane."""
     if ti.static(group.law.deformation == "F"):
         set_matrix(lanes, 0, deformation, lane)
     else:
@@ -189,7 +190,7 @@ def constants_of(rows: ti.template(), lane: int):
 
 @ti.func
 def node_values_of(lanes: ti.template(), first: ti.template(), count: ti.template(), lane: int):
-    """Return `count` numbers, from `first` on, of those of a node that a lane has."""
+    """Return `count` of the nodal values of a lane, from number `first` on."""
     result = ti.Vector.zero(float, count)
     for c in ti.static(range(count)):
         result[c] = lanes[lane, first + c]
@@ -205,7 +206,7 @@ def node_rows_of(
     columns: ti.template(),
     lane: int,
 ):
-    """Return the d rows, each as wide as a node, that a lane has one after another; of each `columns` from `first`."""
+    """Return `columns` columns, from `first` on, of the d x width matrix that a lane stores row by row."""
     result = ti.Matrix.zero(float, d, columns)
     for c in ti.static(range(columns)):
         for a in ti.static(range(d)):

@@ -1,4 +1,4 @@
-"""What a step does at the nodes of the grid between P2G and G2P: fold, velocity, constrain, unfold."""
+"""The update of grid nodes between P2G and G2P: fold, velocity, constrain, unfold."""
 
 from copy import copy
 
@@ -12,12 +12,12 @@ from mpmcli.solver.grid.grid import Grid
 
 @ti.data_oriented
 class NodeUpdate:
-    """Turns momentum into velocity at every node.
+    """Converts momentum to velocity at all nodes.
 
     Attributes:
-        images: mirror images behind walls, which constrain the velocity.
-        colliders: what does so after them, None where there are none.
-        rigid: those that move freely, None where there are none.
+        images: mirror images beyond walls, which constrain the velocity.
+        colliders: colliders, which constrain it after the walls; None if there are none.
+        rigid: freely moving rigid bodies; None if there are none.
     """
 
     def __init__(
@@ -29,7 +29,7 @@ class NodeUpdate:
         self.rigid = rigid
 
     def in_layer(self, grid: Grid, layer: object) -> "NodeUpdate":
-        """Return the update of a layer of nodes, by its number, a variable of a kernel."""
+        """Return the update of a layer of nodes, given its number, a variable of a kernel."""
         view = copy(self)
         view.grid, view.images = grid, self.images.in_layer(layer)
         if view.collides and not view.colliders.own:
@@ -39,17 +39,18 @@ class NodeUpdate:
 
     @ti.func
     def update(self, node: ti.template(), index: int, gravity_step: ti.template(), meets: ti.template() = False):
-        """Update a node and its images; return the square of its velocity, 0 at an image and where there is no mass.
+        """Update a node and its images; return its squared speed, 0 at an image and at a node without mass.
 
-        If it `meets`, nothing changes but the sums of rigid bodies.
+        If `meets`, only the sums of rigid bodies change.
 
-        Gravity, gravity_step (m/s), acts on the momentum of every image near a wall, and elsewhere on the velocity.
+        Gravity, gravity_step (m/s), is added to the momentum of every image near a wall, and elsewhere to the velocity.
         """
         speed_squared = 0.0
-        # Where an image beyond a wall has mass, so has the node inside: a stencil that reaches the one holds the other.
+        # If an image beyond a wall has mass, the node inside has mass too: a stencil that reaches one contains the
+        # other.
         massive = self.grid.nodes[index][ti.static(self.dimension)] > 0
         if ti.static(len(self.grid.period.axes) > 0):
-            # Not so beyond a periodic face.
+            # This does not hold beyond a periodic face.
             massive = massive or self.images.walls.near(node)
         if ti.static(meets):
             massive = massive and self.rigid.near(node, self.dimension) == 1
@@ -63,7 +64,7 @@ class NodeUpdate:
         value = self.grid.part(index, 0)
         pull = gravity_step
         speed_squared = 0.0
-        # Asked for once: what follows from them is most of the code of this loop.
+        # Computed once: the code that depends on them is most of this loop.
         depth, mirror, upper = ti.Vector([REACH + 1] * d), node, ti.Vector.zero(int, d)
         acts, holds = ti.Vector.zero(int, d), ti.Vector.zero(int, d)
         place = ti.static((depth, mirror, upper, acts, holds))
@@ -79,7 +80,8 @@ class NodeUpdate:
                     depth[a], mirror[a], upper[a] = found_depth[a], found_mirror[a], found_upper[a]
                     acts[a], holds[a] = found_acts[a], found_holds[a]
                 total = images.fold(self.grid, 0, node, place, gravity_step, True)
-                # Entry by entry here and below: Taichi loses vectors that are assigned as a whole in static blocks.
+                # Entry by entry here and below, because Taichi loses vectors that are assigned as a whole in static
+                # blocks.
                 for c in ti.static(range(self.grid.kept)):
                     value[c] = total[c]
                 for a in ti.static(range(d)):
@@ -114,12 +116,13 @@ class NodeUpdate:
 
     @ti.func
     def update_before(self, node: ti.template(), index: int, kind: int, place: ti.template()):
-        """Turn the momentum from before stress and forces into velocity: fold and unfold, without any boundary.
+        """Convert the momentum before stress and forces to velocity: fold and unfold without boundary conditions.
 
-        It is that of the shares that bodies keep, and is divided by their mass: bodies that touch give each other
-        nothing, whatever their shares are.
+        Momentum and mass are weighted by the fraction of its motion that each body keeps. Bodies in contact therefore
+        do not exchange momentum, whatever their fractions are.
 
-        Mirror images have it too, so that a wall changes only what stress does; friction changes a change of velocity.
+        Mirror images have this velocity too, so that a wall changes only the contribution of stress; friction acts on
+        the change of velocity.
         """
         first = ti.static(self.grid.kept)
         before = self.grid.part(index, first)
@@ -142,7 +145,7 @@ class NodeUpdate:
     def write(
         self, first: ti.template(), node: ti.template(), index: int, kind: int, place: ti.template(), new: ti.template()
     ):
-        """Write the velocity of a node, and of its images."""
+        """Write the velocity of a node and of its images."""
         if kind < 0:
             self.grid.set_part(index, first, new)
         for k, images in ti.static(enumerate(self.images.kinds)):

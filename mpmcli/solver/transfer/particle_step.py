@@ -1,8 +1,8 @@
-"""The two halves of a step of one particle: what it hands to the nodes around it, and what it takes back from them.
+"""The two halves of a step of one particle: its contribution to nodes in P2G, and its update from nodes in G2P.
 
-Both are functions of variables alone, so that the CPU's loops over lanes (`cpu_transfers`) and the GPU's threads
-(`particle_update`) compile the same ones. MLS-MPM (Hu et al. 2018) with APIC (Jiang et al. 2015), or AFLIP; see
-docs/theory.md, 2.
+Both are functions of local variables only, so that the loops over lanes on the CPU (`cpu_transfers`) and the threads of
+a GPU (`particle_update`) compile the same functions. MLS-MPM (Hu et al. 2018) with APIC (Jiang et al. 2015) or AFLIP;
+see docs/theory.md, 2.
 """
 
 from dataclasses import dataclass
@@ -20,10 +20,13 @@ class Sender:
     """A particle before P2G: variables of a kernel.
 
     Attributes:
-        place: on the grid, m; here: in the domain, m, which differs only for a group that is `total`.
-        v, C: velocity and affine velocity; state: J or F; inner: internal variables.
-        row, constants: its row of the table of its group, and the constants of the law in it.
-        loads: what `loads_on` returned.
+        place: position on the grid, m.
+        here: position in the domain, m; differs from `place` only in a group that is `total`.
+        v, C: velocity and affine velocity.
+        state: J or F.
+        inner: internal variables.
+        row, constants: its row of the table of its group, and the constants of the law in that row.
+        loads: the loads returned by `loads_on`.
     """
 
     place: Any
@@ -39,11 +42,13 @@ class Sender:
 
 @dataclass(frozen=True)
 class Loads:
-    """What acts on a particle from outside: variables of a kernel, zero where the scene has none of it.
+    """External loads on a particle: variables of a kernel, zero for loads that the scene does not have.
 
     Attributes:
-        share: share of its motion that its body keeps; missing: ln J that it lacks of the mean of its cell.
-        push, slope: acceleration by forces, and its gradient; touch, friction: by other bodies, by rough walls; m/s^2.
+        share: fraction of its motion that its body keeps.
+        missing: mean of ln J over its cell minus its own ln J.
+        push, slope: acceleration by forces, m/s^2, and its gradient, 1/s^2.
+        touch, friction: acceleration by other bodies and by friction on walls, m/s^2.
     """
 
     share: Any
@@ -59,10 +64,13 @@ class Receiver:
     """A particle before G2P: variables of a kernel.
 
     Attributes:
-        place: in the domain, m; remainder: what rounding took from it, m.
-        v, C: before the step, where its body keeps a share of its motion; deformation: J - 1 or F - I.
-        constants: of the law; share: of its motion that its body keeps.
-        missing: growth of ln J that it lacks of the mean of its cell.
+        place: position in the domain, m.
+        remainder: rounding error of the position, m.
+        v, C: values before the step, used if its body keeps a fraction of its motion.
+        deformation: J - 1 or F - I.
+        constants: constants of the law.
+        share: fraction of its motion that its body keeps.
+        missing: mean growth of ln J over its cell minus its own growth.
     """
 
     place: Any
@@ -77,12 +85,12 @@ class Receiver:
 
 @dataclass(frozen=True)
 class NodeSums:
-    """What the stencil of a particle holds before G2P: variables of a kernel.
+    """Sums over the stencil of a particle in G2P: variables of a kernel.
 
     Attributes:
-        distance: of the particle from the first node, cells.
-        velocity, moment: sums of the velocity of nodes, see `gather_linear`.
-        old_velocity, old_moment: of the velocity that bodies keep, where they do.
+        distance: distance of the particle from the first node, cells.
+        velocity, moment: sums of nodal velocities, see `gather_linear`.
+        old_velocity, old_moment: sums of the velocity that bodies keep, if any do.
     """
 
     distance: Any
@@ -94,7 +102,7 @@ class NodeSums:
 
 @ti.func
 def loads_on(particles: ti.template(), g: ti.template(), group: ti.template(), p: int, kick: float, counts: bool):
-    """Return the parts of `Loads` of particle p; `counts` is as of `friction_of_walls`."""
+    """Return the attributes of `Loads` for particle p; for `counts` see `friction_of_walls`."""
     d = ti.static(group.dimension)
     share, missing, slope = 0.0, 0.0, ti.Matrix.zero(float, d, d)
     push, touch, friction = ti.Vector.zero(float, d), ti.Vector.zero(float, d), ti.Vector.zero(float, d)
@@ -113,17 +121,17 @@ def loads_on(particles: ti.template(), g: ti.template(), group: ti.template(), p
 
 @ti.func
 def hand_over(particles: ti.template(), group: ti.template(), own: ti.template(), distance: ti.template(), kick: float):
-    """Return what a particle, a `Sender`, hands to its nodes, and the change of its state.
+    """Return the contribution of a particle, a `Sender`, to its nodes, and the change of its state.
 
     Node i receives w_i (m v + A (x_i - x_p)) with A = m C - dt V0 tau / D (Hu et al. 2018, eq. 18), and w_i m.
 
     Args:
-        distance: from the first node of its stencil, cells.
-        kick: time over which stress and forces act, s.
+        distance: distance from the first node of its stencil, cells.
+        kick: time for which stress and forces act, s.
 
     Returns:
         middle, change: momentum and mass at the middle node, and their change per cell and axis, see `momentum`.
-        plastic, inner: what a law that projects adds to J or F, and the internal variables after that.
+        plastic, inner: the change of J or F by the projection of the law, and the internal variables after it.
     """
     grid, d = ti.static((particles.grid, group.dimension))
     seen, stretch = own.state, 1.0
@@ -145,7 +153,7 @@ def hand_over(particles: ti.template(), group: ti.template(), own: ti.template()
         if ti.static(group.has_wall_friction):
             v += kick * own.loads.friction
         v += kick * push_of_walls(particles, group, own.here, own.place, own.state, own.row, own.constants)
-        # Entry by entry: Taichi loses matrices that are assigned as a whole here.
+        # Entry by entry, because Taichi loses matrices that are assigned as a whole here.
         at_rest, nominal = C @ own.state, pulled_back(stress, own.state)
         for i, j in ti.static(ti.ndrange(d, d)):
             C[i, j] = at_rest[i, j]
@@ -168,15 +176,16 @@ def take_back(
     dt: float,
     gravity_step: ti.template(),
 ):
-    """Return a particle, a `Receiver`, after a step of dt with these `NodeSums`.
+    """Return the new state of a particle, a `Receiver`, after a step of dt with the given `NodeSums`.
 
     x += dt v, and F <- (I + dt C) F or J *= det(I + dt C); on the grid of the state at rest F += dt dv/dX.
 
     Returns:
         v, C: velocity and affine velocity.
         place, remainder, beyond: see `ParticleUpdate.moved`.
-        deformation: J - 1 or F - I; growth: ln J that the step added, where the group is `evened`.
-        rate: of deformation, 1/s (see `deformation_rate`).
+        deformation: J - 1 or F - I.
+        growth: increase of ln J in the step, if the group is `evened`.
+        rate: rate of deformation, 1/s (see `deformation_rate`).
     """
     grid, d = ti.static((particles.grid, group.dimension))
     C = centred(grid, sums.distance, sums.velocity, sums.moment).transpose()
@@ -220,7 +229,7 @@ def momentum(
     stress: ti.template(),
     kick: float,
 ):
-    """Return the momentum and mass that the middle node of a stencil would take, and their change per cell and axis."""
+    """Return unweighted momentum and mass at the middle node of a stencil, and their change per cell and axis."""
     d = ti.static(grid.dimension)
     middle = ti.Vector.zero(float, grid.width)
     change = ti.Matrix.zero(float, d, grid.width)
@@ -244,7 +253,7 @@ def add_kept(
     middle: ti.template(),
     change: ti.template(),
 ):
-    """Set what a stencil takes of the share, of that mass, that a body keeps of its motion, see `momentum`."""
+    """Set the entries of `middle` and `change` for the motion that a body keeps, with its mass; see `momentum`."""
     d, kept = ti.static((grid.dimension, grid.kept))
     for c in ti.static(range(d)):
         middle[kept + c] = mass * v[c]
@@ -256,9 +265,9 @@ def add_kept(
 
 @ti.func
 def centred(grid: ti.template(), distance: ti.template(), velocity: ti.template(), moment: ti.template()):
-    """Return the gradient of the velocity at a point from sums over its stencil, see `gather_linear`.
+    """Return the velocity gradient at a point from sums over its stencil, see `gather_linear`.
 
-    It is sum w_i (x_i - x) v_i^T / D: row a is dv/dx_a.
+    It is the sum of w_i (x_i - x) v_i^T / D; row a is dv/dx_a.
     """
     gradient = moment
     for a in ti.static(range(moment.n)):
@@ -269,10 +278,10 @@ def centred(grid: ti.template(), distance: ti.template(), velocity: ti.template(
 
 @ti.func
 def turned(grid: ti.template(), gained: ti.template(), v: ti.template(), C: ti.template(), H: ti.template(), dt: float):
-    """Return what C takes so that a velocity v that a particle keeps, and C with it, turn no angular momentum.
+    """Return the change of C by which kept velocity v and affine velocity C conserve angular momentum.
 
-    It is dt (g v^T - v g^T) / (2 D) + dt (C H^T - H C^T) / 2: g is what the nodes gained since, but from
-    gravity, and H the gradient of the share that is kept, both without what was lost (docs/theory.md, 2.3).
+    It is dt (g v^T - v g^T) / (2 D) + dt (C H^T - H C^T) / 2, where g is the change of the nodal velocity without
+    gravity and H the gradient of the nodal velocity of the kept motion (docs/theory.md, 2.3).
     """
     d = ti.static(grid.dimension)
     result, scale = ti.Matrix.zero(float, d, d), 0.5 * dt * grid.gradient_scale * grid.inverse_spacing
@@ -284,7 +293,7 @@ def turned(grid: ti.template(), gained: ti.template(), v: ti.template(), C: ti.t
 
 @ti.func
 def deformed_gradient(H: ti.template(), C: ti.template(), dt: float):
-    """Return F - I after a step from H = F - I before it, d rows: it grows by dt C + dt C H."""
+    """Return F - I after a step from H = F - I before it, d rows: H + dt C + dt C H."""
     new = H
     for i in ti.static(range(H.n)):
         for k in ti.static(range(H.n)):

@@ -1,4 +1,4 @@
-"""P2G and G2P of one particle as a thread of a GPU does them, with atomics, and how particles move on any device."""
+"""P2G and G2P of one particle by a GPU thread, with atomics, and the motion of particles on any device."""
 
 from collections.abc import Sequence
 from copy import copy
@@ -18,7 +18,7 @@ from mpmcli.solver.transfer.volume import missing_growth, relax_volume
 
 @ti.func
 def scatter_volume(x: ti.template(), volume: float, grid: ti.template(), atomic: ti.template()):
-    """Add the volume of a particle at rest, m^3, to `grid.filling`."""
+    """Add the volume at rest of a particle, m^3, to `grid.filling`."""
     base, distance = grid.scheme.spline.stencil(x, grid.inverse_spacing)
     w = grid.scheme.spline.weights(distance)
     middle = ti.Vector.zero(float, grid.filling.n)
@@ -41,7 +41,7 @@ def add_fixed(
     middle: ti.template(),
     change: ti.template(),
 ):
-    """Add momentum and mass, which it scales, to sums in fixed point if there is room for them; return whether so."""
+    """Scale momentum and mass and add them to sums in fixed point if they fit; return whether they fit."""
     fits = grid.fixed.scaled(mass, middle, change)
     if fits:
         add_linear(sums, grid, first, w, middle, change, True)
@@ -49,24 +49,29 @@ def add_fixed(
 
 
 NOT_LOST = 2**31 - 1
-# A particle crushed to less than this fraction of its volume is lost: near zero J is round-off, not physics.
+# A particle compressed below this fraction of its volume is lost: J near zero is round-off error.
 SMALLEST_J = 1e-6
-# Cells beyond an open face at which particles stay until the next sort retires them: as far as nodes reach.
+# Largest distance beyond an open face, cells, at which particles wait for the next sort to retire them; nodes extend so
+# far.
 BEYOND = 1.99
 
 
 @ti.data_oriented
 class ParticleUpdate:
-    """Both halves of a step of a particle, as a GPU takes them; on the CPU see `cpu_transfers`.
+    """Both halves of a step of a particle on a GPU; for the CPU see `cpu_transfers`.
 
     Attributes:
-        near: the nodes that stencils find: those of the grid, or on a sparse one those of a window.
-        extent: size of the domain, m; last: node of the upper walls, per axis; faces: words of the walls, per axis.
-        contact: between elastic bodies that are `total`; has_contact: whether there is any.
-        friction, moving: coefficients and velocities of the walls; run: number of the run that a view is for.
-        watches_box: whether a particle whose stencil has left the nodes in use is lost: on a GPU, where speeds are not
-            read back at every step.
-        lost: per group, the first particle (in solver order, by its id where the grid is `deterministic`) that left the
+        near: the nodes that stencils address: those of the grid, or on a sparse grid those of a window.
+        extent: size of the domain per axis, m.
+        last: node of the upper wall per axis.
+        faces: conditions of the walls per axis.
+        contact: contact between elastic bodies that are `total`, None without contact.
+        has_contact: whether `contact` is not None.
+        friction, moving: coefficients of friction and velocities of the walls.
+        run: number of the run of a view.
+        watches_box: whether a particle whose stencil has left the nodes in use is lost; true on a GPU, where speeds are
+            not read back at every step.
+        lost: per group, the first particle (in solver order, or by id if the grid is `deterministic`) that left the
             domain, was inverted or is not finite, or NOT_LOST.
     """
 
@@ -92,14 +97,14 @@ class ParticleUpdate:
         self.lost.fill(NOT_LOST)
 
     def beside(self, nodes: LinearNodes) -> "ParticleUpdate":
-        """Return an update whose stencils find these nodes."""
+        """Return an update whose stencils address these nodes."""
         result = copy(self)
         result.near = nodes
         return result
 
     @ti.func
     def scatter(self, g: ti.template(), group: ti.template(), p: int, kick: float, relaxed: float):
-        """Scatter one particle, with atomics; one that is crushed is lost: its stress would spread NaN."""
+        """Scatter one particle, with atomics; a crushed particle is lost, because its stress would spread NaN."""
         state, row = group.stored(p), group.row(p)
         if volume_ratio(group, state) > SMALLEST_J:
             (grid,) = ti.static((self.near,))
@@ -127,10 +132,10 @@ class ParticleUpdate:
 
     @ti.func
     def relax(self, group: ti.template(), p: int, relaxed: float):
-        """Relax the volume of one particle over a time, s, after P2G; return the change of its logarithm."""
+        """Relax the volume of one particle over a time, s, after P2G; return the absolute change of its logarithm."""
         change = 0.0
         _v, C = group.motion(p)
-        # What is at rest stays as it is.
+        # A particle at rest is not relaxed.
         if deformation_rate(group, C) > 0.0:
             change = relax_volume(group, self.grid, self.last, p, group.x[p], relaxed)
         return change
@@ -174,7 +179,8 @@ class ParticleUpdate:
         if ti.static(group.evened):
             group.growth[p] = growth
 
-        # Written so that a NaN is not sound; then it stays, and no later step writes outside the grid.
+        # Written so that a NaN is not sound: the particle then does not move, and no later step writes outside the
+        # grid.
         sound = beyond <= 0.5 * self.grid.spacing
         if ti.static(self.watches_box and not group.total):
             base_after, _ = self.grid.scheme.spline.stencil(inside, self.grid.inverse_spacing)
@@ -197,10 +203,10 @@ class ParticleUpdate:
 
     @ti.func
     def moved(self, group: ti.template(), x: ti.template(), remainder: ti.template(), v: ti.template(), dt: float):
-        """Return where a particle at x moves in dt, the remainder there, and how far it would leave the domain, all m.
+        """Return the new position of a particle after dt, its new remainder, and the distance beyond the domain, all m.
 
-        remainder: what rounding took from x: the sum loses nothing (Dekker 1971; docs/theory.md, 8.3). The place is
-        inside the domain, but for open faces and along periodic axes.
+        The remainder is the rounding error of x, so that the sum is compensated (Dekker 1971; docs/theory.md, 8.3). The
+        position is clamped to the domain, except at open faces and along periodic axes.
         """
         inside, after, beyond = ti.Vector.zero(float, self.dimension), ti.Vector.zero(float, self.dimension), 0.0
         for c in ti.static(range(self.dimension)):
@@ -211,7 +217,7 @@ class ParticleUpdate:
                 beyond += out * self.grid.spacing
             else:
                 low, high = 0.0, self.extent[c]
-                # Until the next sort, which retires it, a particle moves on beyond an open face.
+                # A particle moves on beyond an open face until the next sort retires it.
                 if ti.static((c, 0) in self.grid.opens):
                     low = -BEYOND * self.grid.spacing
                 if ti.static((c, 1) in self.grid.opens):
@@ -222,6 +228,6 @@ class ParticleUpdate:
                 if ti.static(group.carries):
                     after[c] = ti.select(moved == inside[c], way - (opaque(inside[c]) - x[c]), 0.0)
                     if ti.static((c, 0) in self.grid.opens):
-                        # `opaque` is for numbers that are not negative.
+                        # `opaque` requires non-negative numbers.
                         after[c] = ti.select(inside[c] > 0.0, after[c], 0.0)
         return inside, after, beyond

@@ -1,13 +1,13 @@
-"""Shifts particles of liquids and grains out of crowds that flow piles up (docs/theory.md, 5.12).
+"""Shifts particles of liquids and grains out of crowds that flow creates (docs/theory.md, 5.12).
 
-Flow stretches the lattice of particles along its own axes: rows part and planes pile up, which the grid cannot see, as
-planes a cell apart fill it as evenly as any. In the steps that relax volumes, a fine grid with a node for about each
-particle shows the crowds, and particles move out of them by as much as the flow has strained them since the last time.
-The mean of that motion, as the grid itself sees it, is taken back. v changes by C times the way: velocities of places
-stay.
+Flow stretches the lattice of particles along its own axes: rows separate and planes pile up. The grid does not resolve
+this, because the weights of planes one cell apart sum to 1. In the steps that relax volumes, a fine grid with about one
+node per particle resolves the crowds. Particles move down the gradient of its filling by an amount that grows with the
+strain since the last shift. The mean of this motion on the grid is then subtracted. v changes by C times the
+displacement, so that the velocity field does not change.
 
-Below are the bodies of the phases that do this, each for one node or one particle, `at` being a `Part` of a CPU or an
-`Item` of a GPU, and time that since the last shift, s.
+The functions below are the bodies of the phases of a shift, each for one node or one particle. `at` is a `Part` on a
+CPU or an `Item` on a GPU; `time` is the time since the last shift, s.
 """
 
 import math
@@ -37,12 +37,12 @@ from mpmcli.solver.transfer.stencils import add_linear, gather_linear, node_of, 
 from mpmcli.solver.transfer.volume import image_along
 from mpmcli.stability.transfer_factors import FARTHEST
 
-# Share of a crowd's slope that a particle follows: 8 times the strain since the last shift, 1 for large strains.
+# Factor s of the strain e since the last shift: a particle moves by s e / (1 + s e) of the gradient of the filling.
 PUSH = 8.0
 
 
 def fine_nodes(scene: Scene, laws: Sequence[Law]) -> int:
-    """Return the fine nodes per cell along an axis, as many as particles of what is shifted; 0 where nothing is."""
+    """Return the fine nodes per cell along an axis, about one per shifted particle; 0 if no particles are shifted."""
     flowing = {law.name for law in laws if law.shifts}
     if not scene.solver.redistribute:
         return 0
@@ -52,17 +52,18 @@ def fine_nodes(scene: Scene, laws: Sequence[Law]) -> int:
 
 
 def farthest_shift(fine: "FineGrid | None") -> float:
-    """Return by how many cells a shift moves particles at most, there and back."""
+    """Return the largest displacement of a particle by a shift and the subtraction of its mean, cells."""
     return 2 * FARTHEST / fine.per_cell if fine else 0.0
 
 
 @ti.data_oriented
 class FineGrid(LinearNodes):
-    """Nodes about as far apart as particles: of those of a grid every `per_cell`-th along each axis.
+    """Nodes about as far apart as particles, `per_cell` per cell of a grid along each axis.
 
     Attributes:
-        per_cell: nodes per cell along an axis; in_cell: in all.
-        fill: Vector(1) field: the fraction of a fine cell that particles fill, then what exceeds a whole one.
+        per_cell: nodes per cell along an axis.
+        in_cell: nodes per cell.
+        fill: Vector(1) field: the filled fraction of each fine cell; after `fold_fine` its excess over 1.
     """
 
     width = 1
@@ -77,7 +78,7 @@ class FineGrid(LinearNodes):
 
     @ti.func
     def place_in_cell(self, node: ti.template(), q: int):
-        """Return the integer coordinates of the q-th fine node in the cell behind a node of the grid."""
+        """Return the integer coordinates of the q-th fine node in the cell whose first node is `node`."""
         place = node * self.per_cell
         for a in ti.static(range(self.dimension)):
             place[a] += q // ti.static(self.per_cell ** (self.dimension - 1 - a)) % self.per_cell
@@ -85,14 +86,14 @@ class FineGrid(LinearNodes):
 
     @ti.func
     def stencil(self, x: ti.template(), inverse_spacing: float):
-        """Return the first node of the stencil of a point and the distance to it; inverse_spacing: that of the grid."""
+        """Return the first node of the stencil of a point and the distance from it, given the 1/h of the grid."""
         base, distance = self.scheme.spline.stencil(x, inverse_spacing * self.per_cell)
         return base + ti.static(PAD * (self.per_cell - 1)), distance
 
 
 @ti.data_oriented
 class FineBlocks(BlockNodes, FineGrid):
-    """Those of a sparse grid: a block has the fine nodes of its cells."""
+    """The fine nodes of a sparse grid: a block stores the fine nodes of its cells."""
 
     def __init__(self, grid: SparseGrid, per_cell: int) -> None:
         super().__init__(grid, per_cell)
@@ -102,7 +103,7 @@ class FineBlocks(BlockNodes, FineGrid):
 
 @ti.func
 def inside_along(j: int, axis: ti.template(), grid: ti.template(), last: ti.template(), n: ti.template()):
-    """Return whether node j of a grid with n nodes in a cell is no image behind a face of an axis."""
+    """Return whether node j of a grid with n nodes per cell is not an image node beyond a face of an axis."""
     inside = True
     if ti.static((axis, 0) not in grid.opens):
         inside = j >= ti.static(PAD * n)
@@ -113,7 +114,7 @@ def inside_along(j: int, axis: ti.template(), grid: ti.template(), last: ti.temp
 
 @ti.func
 def clear_fine(at: ti.template(), node: ti.template(), time: float):
-    """Clear a node, and the fine nodes of the cell behind it."""
+    """Clear a node and the fine nodes of its cell."""
     at.grid.clear(at.grid.linear_index(node))
     for q in range(ti.static(at.grid.fine.in_cell)):
         index = at.grid.fine.linear_index(at.grid.fine.place_in_cell(node, q))
@@ -124,13 +125,13 @@ def clear_fine(at: ti.template(), node: ti.template(), time: float):
 
 @ti.func
 def fill_fine(at: ti.template(), p: int, time: float):
-    """Add the volume of particle p to the fine nodes around it, as a fraction of a fine cell, at most a whole one."""
+    """Add the volume of particle p to its fine nodes, as a fraction of a fine cell of at most 1."""
     (fine,) = ti.static((at.grid.fine,))
     base, distance = fine.stencil(at.group.x[p], at.grid.inverse_spacing)
     volume = at.group.row(p)[VOLUME]
     for _ in ti.static(range(fine.dimension)):
         volume *= ti.static(float(fine.per_cell)) * at.grid.inverse_spacing
-    # What is coarser than the fine grid is no crowd by itself.
+    # A particle larger than a fine cell is not a crowd by itself.
     volume = ti.min(volume, 1.0)
     w = fine.scheme.spline.weights(distance)
     even = ti.Matrix.zero(float, fine.dimension, 1)
@@ -151,7 +152,7 @@ def fill_range(at: ti.template(), first: int, last: int, time: float):
 
 @ti.func
 def fine_to_float(at: ti.template(), node: ti.template(), time: float):
-    """Read sums in fixed point."""
+    """Convert the sums of the fine nodes from fixed point."""
     for q in range(ti.static(at.grid.fine.in_cell)):
         index = at.grid.fine.linear_index(at.grid.fine.place_in_cell(node, q))
         at.grid.fine.fill[index][0] = at.grid.fixed.fine.value(index)[0] / ti.static(at.grid.fixed.of_fine)
@@ -159,9 +160,9 @@ def fine_to_float(at: ti.template(), node: ti.template(), time: float):
 
 @ti.func
 def fold_fine(at: ti.template(), node: ti.template(), time: float):
-    """Add to fine nodes what their images behind the faces of an axis hold; after the last axis keep what exceeds 1.
+    """Add values of image nodes beyond the faces of an axis to fine nodes; after the last axis keep the excess over 1.
 
-    Nodes on a wall count twice: half of what is around them is outside. Images get the same.
+    Nodes on a wall count twice, because half of their cell is outside. Images receive the same value.
     """
     grid, fine, last, d = ti.static((at.grid, at.grid.fine, at.particles.last, at.grid.dimension))
     for axis in ti.static(range(d)):
@@ -187,7 +188,7 @@ def fold_fine(at: ti.template(), node: ti.template(), time: float):
 
 @ti.func
 def shift(at: ti.template(), p: int, time: float):
-    """Move particle p down the slope of its crowd, and add how far it moved, and its mass, to the nodes around it."""
+    """Move particle p down the gradient of the filling; add its mass and mass times displacement to its nodes."""
     grid, fine, group, d = ti.static((at.grid, at.grid.fine, at.group, at.grid.dimension))
     v, C = group.motion(p)
     x = group.x[p]
@@ -203,7 +204,7 @@ def shift(at: ti.template(), p: int, time: float):
 
 @ti.func
 def unshift(at: ti.template(), p: int, time: float):
-    """Move particle p back by the mean motion around it."""
+    """Subtract the mean displacement at particle p from its position."""
     grid, group, d = ti.static((at.grid, at.group, at.grid.dimension))
     v, C = group.motion(p)
     x = group.x[p]
@@ -230,7 +231,7 @@ def shift_range(at: ti.template(), first: int, last: int, time: float):
 
 @ti.func
 def unshift_range(at: ti.template(), first: int, last: int, time: float):
-    """Move particles first to last - 1 back by the mean motion around them."""
+    """Subtract the mean displacements at particles first to last - 1 from their positions."""
     if ti.static(at.grid.sparse):
         for p in range(first, last):
             unshift(at, p, time)
@@ -240,7 +241,7 @@ def unshift_range(at: ti.template(), first: int, last: int, time: float):
 
 @ti.func
 def shift_lanes(at: ti.template(), first: int, last: int, time: float, back: ti.template()):
-    """Do so with LANES of them at once; see `lanes`."""
+    """Shift particles first to last - 1, or unshift them if `back`, LANES at a time; see `lanes`."""
     grid, fine, group, d = ti.static((at.grid, at.grid.fine, at.group, at.grid.dimension))
     nodes = ti.static(grid.scheme.spline.nodes)
     x, v, affine, ways = zero_lanes(d), zero_lanes(d), zero_lanes(ti.static(d * d)), zero_lanes(d)
@@ -312,7 +313,7 @@ def store_weights(lanes: ti.template(), w: ti.template(), lane: int):
 
 @ti.func
 def slope_of(fine: ti.template(), first: ti.template(), w: ti.template(), distance: ti.template()):
-    """Return the gradient of `FineGrid.fill` per fine cell, sum n_j grad w_j over a stencil."""
+    """Return the gradient of `FineGrid.fill` per fine cell, the sum of fill_j grad w_j over a stencil."""
     d = ti.static(fine.dimension)
     slopes = ti.Matrix.rows([distance - 1.5, 2.0 - 2.0 * distance, distance - 0.5])
     result, origin = ti.Vector.zero(float, d), origin_of(first, fine)
@@ -333,7 +334,7 @@ def slope_of(fine: ti.template(), first: ti.template(), w: ti.template(), distan
 
 @ti.func
 def way_down(at: ti.template(), slope: ti.template(), C: ti.template(), time: float):
-    """Return the way of a particle down the slope of its crowd, m; what is at rest stays as it is."""
+    """Return the displacement of a particle down the gradient of the filling, m; 0 at zero strain rate."""
     strain = PUSH * time * shear_rate(C)
     way = -strain / (1.0 + strain) * slope
     return way * (FARTHEST / ti.max(way.norm(), FARTHEST) * (at.grid.spacing * ti.static(1.0 / at.grid.fine.per_cell)))
@@ -341,14 +342,14 @@ def way_down(at: ti.template(), slope: ti.template(), C: ti.template(), time: fl
 
 @ti.func
 def add_shift(at: ti.template(), first: ti.template(), w: ti.template(), mass: float, way: ti.template()):
-    """Add the way of a particle times its mass, and its mass, to the nodes of a stencil."""
+    """Add the mass of a particle times its displacement, and its mass, to the nodes of a stencil."""
     grid, d = ti.static((at.grid, at.grid.dimension))
     value, even = ti.Vector.zero(float, grid.width), ti.Matrix.zero(float, d, grid.width)
     for a in ti.static(range(d)):
         value[a] = mass * way[a]
     value[d] = mass
     if ti.static(grid.deterministic):
-        # As a speed for which the sums have room.
+        # Convert to a speed within the range of the sums.
         for a in ti.static(range(d)):
             value[a] *= grid.fixed.pace[grid.fixed.run][2] * grid.inverse_spacing
         if grid.fixed.scaled(mass, value, even):
@@ -359,7 +360,7 @@ def add_shift(at: ti.template(), first: ti.template(), w: ti.template(), mass: f
 
 @ti.func
 def shift_to_float(at: ti.template(), node: ti.template(), time: float):
-    """Read sums in fixed point."""
+    """Convert the sums of a node from fixed point."""
     (grid,) = ti.static((at.grid,))
     index = grid.linear_index(node)
     grid.fixed.to_float(grid, index, 0.0)
@@ -369,9 +370,9 @@ def shift_to_float(at: ti.template(), node: ti.template(), time: float):
 
 @ti.func
 def fold_shift(at: ti.template(), node: ti.template(), time: float):
-    """Add to nodes what their images behind the faces of an axis hold; after the last axis they have the mean motion.
+    """Add values of image nodes beyond the faces of an axis to nodes; after the last axis divide by the mass.
 
-    That of images is mirrored: odd along the normal of a wall.
+    Displacements of images are mirrored: odd along the normal of a wall.
     """
     grid, last, d = ti.static((at.grid, at.particles.last, at.grid.dimension))
     for axis in ti.static(range(d)):
@@ -402,7 +403,7 @@ def mirrored(value: ti.template(), axis: ti.template(), grid: ti.template()):
 
 @ti.func
 def held_back(at: ti.template(), x: ti.template(), way: ti.template()):
-    """Return the way, m, that a particle at x may go: at most half of that to a wall or a collider."""
+    """Return the displacement, m, limited to half the distance from x to a wall or a collider."""
     (grid,) = ti.static((at.grid,))
     result = way
     if ti.static(at.nodes.collides):

@@ -1,9 +1,8 @@
-"""Sums over the stencil of a spline, and their transpose: what varies linearly is added to its nodes, and gathered.
+"""Weighted sums over the stencil of a spline (gather), and their transpose for linearly varying quantities (scatter).
 
-Both walk the stencil axis by axis: planes of lines of three nodes along the last axis. Positions are measured from its
-middle node, so that its nodes lie at -1, 0 and 1: moments are then differences of sums that are at hand. A cubic
-stencil has one node more, at 2. On the CPU every node is four numbers wide, which the compiler turns into vector
-instructions.
+Both visit the stencil axis by axis: planes of lines of three nodes along the last axis. Positions are relative to its
+middle node, so that its nodes lie at -1, 0 and 1, and moments are differences of sums already computed. A cubic stencil
+has one more node, at 2. On the CPU every node is four numbers wide, which the compiler vectorises.
 """
 
 from mpmcli.quick_taichi import ti
@@ -23,13 +22,16 @@ def add_linear(
 ):
     """Add to the nodes of a stencil a quantity that varies linearly over it, weighted by the spline.
 
-    field: of the nodes, or sums in fixed point, to which the rest is scaled; first: `stencil_at` the first node;
-    middle: the quantity at the middle node; change: its change per cell, a row per axis.
+    Args:
+        field: field of the nodes, or sums in fixed point, for which the quantity is already scaled.
+        first: `stencil_at` of the first node.
+        middle: the quantity at the middle node.
+        change: its change per cell, a row per axis.
     """
     d, width = ti.static((grid.dimension, middle.n))
     origin = origin_of(first, grid)
     for i in ti.static(range(grid.planes)):
-        # At the middle of a plane, weighted along the first axis, and the changes along the others.
+        # The quantity at the middle of a plane and its changes along the other axes, weighted along the first axis.
         plane, across, along = middle, ti.Vector.zero(float, width), ti.Vector.zero(float, width)
         if ti.static(d == 3):
             add_multiple(plane, ti.static(i - 1), row_of(change, 0, width))
@@ -53,7 +55,7 @@ def add_linear(
 
 @ti.func
 def origin_of(first: ti.template(), grid: ti.template()):
-    """Return `stencil_at` the first node of a stencil, `bounded` where a dense grid has few enough nodes."""
+    """Return `stencil_at` of the first node of a stencil, `bounded` if a dense grid has at most LOW_BITS nodes."""
     if ti.static(not grid.sparse and grid.runs * grid.layers * grid.node_count <= LOW_BITS):
         return bounded(first)
     else:
@@ -79,7 +81,7 @@ def row_of(matrix: ti.template(), row: ti.template(), width: ti.template()):
 
 @ti.func
 def columns(vector: ti.template(), matrix: ti.template(), first: ti.template(), count: ti.template()):
-    """Return `count` entries of a vector, and as many columns of a matrix, from `first` on."""
+    """Return `count` entries of a vector and `count` columns of a matrix, from `first` on."""
     entries, part = ti.Vector.zero(float, count), ti.Matrix.zero(float, matrix.n, count)
     for c in ti.static(range(count)):
         entries[c] = vector[first + c]
@@ -113,13 +115,16 @@ def add(field: ti.template(), node: int, share: ti.template(), atomic: ti.templa
 
 @ti.func
 def gather_linear(field: ti.template(), grid: ti.template(), first: ti.template(), w: ti.template()):
-    """Return the weighted sums over a stencil of what nodes hold, and of that times the cells from the middle node."""
+    """Return the weighted sums over a stencil of nodal values, and of values times their offset in cells.
+
+    Offsets are measured from the middle node.
+    """
     d, width = ti.static((grid.dimension, field.n))
     origin = origin_of(first, grid)
     velocity = ti.Vector.zero(float, width)
     moment = ti.Matrix.zero(float, d, width)
     for i in ti.static(range(grid.planes)):
-        # Sums over a plane, and of these times the cells from its middle along its axes.
+        # Sums over a plane, and sums of values times the offset in cells from its middle along its axes.
         plane = ti.Vector.zero(float, width)
         across = ti.Vector.zero(float, width)
         along = ti.Vector.zero(float, width)

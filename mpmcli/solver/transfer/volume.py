@@ -1,13 +1,13 @@
-"""Corrects the volumes of particles: by the mean of a cell, and by the volume that the grid sees.
+"""Corrects the volumes of particles by the mean of a cell (F-bar) and by the density on the grid.
 
-Particles of a cell may share their change of volume, so that nearly incompressible material does not lock. The law of a
-particle sees F (J'/J)^(1/d), where ln J' is the mean of ln J over the particles of its cell, weighted by their volumes
-at rest: F-bar (de Souza Neto et al. 1996) with the projection of B-bar (Hughes 1980). Where particles change cells
-(`ParticleArrays.evened`) F itself grows by the mean growth of its cell. See docs/theory.md, 4.4. Only groups that ask
-for it (`ParticleArrays.uses_f_bar`) have any of this compiled.
+Particles of a cell may share their change of volume, so that nearly incompressible material does not lock. The law then
+receives F (J'/J)^(1/d), where ln J' is the mean of ln J over the particles of the cell, weighted by their volumes at
+rest: F-bar (de Souza Neto et al. 1996) with the projection of B-bar (Hughes 1980). If particles change cells
+(`ParticleArrays.evened`), F itself takes the mean growth of ln J of its cell. See docs/theory.md, 4.4. This code is
+compiled only for groups with `ParticleArrays.uses_f_bar`.
 
-The volumes of liquids and grains relax towards those that the grid sees (docs/theory.md, 5.11): laws that ask for it
-(`Law.relaxes`) have this compiled, and one step in `INTERVAL` does it.
+The volumes of liquids and grains relax towards the density on the grid (docs/theory.md, 5.11). This code is compiled
+only for laws with `Law.relaxes` and runs in one step of every `INTERVAL`.
 """
 
 from collections.abc import Sequence
@@ -47,7 +47,7 @@ def cell_of(grid: ti.template(), x: ti.template()):
     cell = ti.Vector.zero(int, ti.static(grid.dimension))
     for a in ti.static(range(grid.dimension)):
         if ti.static(a in grid.period.axes):
-            # Of a particle beyond the lower face the coordinate is negative.
+            # The coordinate of a particle beyond the lower face is negative.
             cell[a] = ti.cast(ti.floor(x[a] * grid.inverse_spacing), int) + PAD
         else:
             cell[a] = ti.cast(x[a] * grid.inverse_spacing, int) + PAD
@@ -56,7 +56,7 @@ def cell_of(grid: ti.template(), x: ti.template()):
 
 @ti.func
 def cell_of_particle(grid: ti.template(), group: ti.template(), p: int):
-    """Return the linear index of the first node of the cell of a particle, in the layer of its body."""
+    """Return the linear index of the first node of the cell of a particle in the layer of its body."""
     cell = cell_of(grid, group.on_grid(p))
     if ti.static(group.layers > 1):
         cell += group.layer_of(p) * ti.static(grid.node_count)
@@ -65,13 +65,13 @@ def cell_of_particle(grid: ti.template(), group: ti.template(), p: int):
 
 @ti.func
 def log_volume(H: ti.template()):
-    """Return ln J from F - I, finite where a particle is crushed or inverted, too."""
+    """Return ln J from F - I; the result is finite for crushed and inverted particles too."""
     return log(1.0 + ti.max(volume_strain(H), ti.static(SMALLEST - 1.0)))
 
 
 @ti.func
 def average_range(grid: ti.template(), g: ti.template(), group: ti.template(), first: int, last: int):
-    """Add particles first to last - 1 of the g-th group to their cells; no other thread may write to these."""
+    """Add particles first to last - 1 of the g-th group to the sums of their cells, which no other thread may write."""
     d = ti.static(group.dimension)
     x, deformation = zero_lanes(d), zero_lanes(ti.static(d * d))
     volumes, logs, cells = ti.Vector.zero(float, LANES), ti.Vector.zero(float, LANES), ti.Vector.zero(int, LANES)
@@ -87,7 +87,7 @@ def average_range(grid: ti.template(), g: ti.template(), group: ti.template(), f
             repeat_first(deformation, count)
             repeat_first(x, count)
         for lane in range(LANES):
-            # What lies beyond the last particle is no row of the table.
+            # Memory beyond the last particle holds no row number of the table.
             volumes[lane] = group.row(begin + ti.min(lane, count - 1))[VOLUME]
         for lane in range(LANES):
             logs[lane] = log_volume(matrix_of(deformation, 0, d, lane))
@@ -104,7 +104,7 @@ def average_range(grid: ti.template(), g: ti.template(), group: ti.template(), f
 
 @ti.func
 def add_volume(grid: ti.template(), g: ti.template(), group: ti.template(), p: int):
-    """Add particle p to its cell, with atomics."""
+    """Add particle p to the sums of its cell, with atomics."""
     H = ti.Matrix.zero(float, group.dimension, group.dimension)
     for i, j in ti.static(ti.ndrange(group.dimension, group.dimension)):
         H[i, j] = group.displacement_gradient[p][i, j]
@@ -125,7 +125,7 @@ def add_volume(grid: ti.template(), g: ti.template(), group: ti.template(), p: i
 
 @ti.func
 def clear_mean(grid: ti.template(), g: ti.template(), group: ti.template(), p: int):
-    """Set the sums of the cell of particle p, and of its images, to zero."""
+    """Set the sums of the cell of particle p and of its periodic images to zero."""
     cell = cell_of_particle(grid, group, p)
     clear_cell(grid, g, cell)
     if ti.static(len(grid.period.axes) > 0):
@@ -153,7 +153,7 @@ def sums_at(grid: ti.template(), g: ti.template(), cell: int):
 
 @ti.func
 def sums_of_cell(grid: ti.template(), g: ti.template(), cell: int):
-    """Return the sums of a cell and its images, once all particles were added."""
+    """Return the sums over a cell and its periodic images, after all particles were added."""
     sums = sums_at(grid, g, cell)
     if ti.static(len(grid.period.axes) > 0):
         for images in range(1, ti.static(2**grid.dimension)):
@@ -167,34 +167,34 @@ def sums_of_cell(grid: ti.template(), g: ti.template(), cell: int):
 
 @ti.func
 def missing_to_mean(grid: ti.template(), g: ti.template(), group: ti.template(), p: int):
-    """Return the mean of ln J over the cell of particle p less its own."""
+    """Return the mean of ln J over the cell of particle p minus its own ln J."""
     sums = sums_of_cell(grid, g, group.cell[p])
     return sums[0] / sums[2] - group.to_mean[p]
 
 
 @ti.func
 def missing_growth(grid: ti.template(), g: ti.template(), group: ti.template(), p: int):
-    """Return the mean over the cell of particle p of the growth of ln J in the last step, less its own."""
+    """Return the mean growth of ln J in the last step over the cell of particle p minus its own growth."""
     sums = sums_of_cell(grid, g, group.cell[p])
     return sums[1] / sums[2] - group.growth[p]
 
 
 @ti.func
 def stretch_to(missing: float, d: ti.template()):
-    """Return the factor of F by which ln J grows by `missing`."""
+    """Return the factor of F that increases ln J by `missing`."""
     return exp(missing * ti.static(1.0 / d))
 
 
 @ti.func
 def even(H: ti.template(), missing: float):
-    """Return F - I from F - I before, once ln J has grown by `missing`."""
+    """Return F - I after an increase of ln J by `missing`, given F - I before it."""
     d = ti.static(H.n)
     return H + exp_minus_1(missing * ti.static(1.0 / d)) * (H + ti.Matrix.identity(float, d))
 
 
 @ti.func
 def average_for_frame(grid: ti.template(), g: ti.template(), group: ti.template(), first: int, last: int):
-    """Leave in `to_mean` of all particles of a run what `missing_to_mean` returns; on one thread."""
+    """Store `missing_to_mean` of all particles of a run in `to_mean`, on one thread."""
     for p in range(first, last):
         clear_mean(grid, g, group, p)
     average_range(grid, g, group, first, last)
@@ -203,9 +203,9 @@ def average_for_frame(grid: ti.template(), g: ti.template(), group: ti.template(
 
 
 def needs_filling(scene: Scene, laws: Sequence[Law], layers: int) -> bool:
-    """Return whether nodes keep the volume scattered to them, that of all layers in layer 0.
+    """Return whether nodes store the volume scattered to them, in layer 0 for all layers.
 
-    With one density and one layer alone it follows from their mass.
+    With a single density and a single layer it follows from their mass.
     """
     alike = len({body.material.density for body in scene.sources}) == 1 and layers == 1
     return any(law.relaxes for law in laws) and not alike
@@ -213,12 +213,12 @@ def needs_filling(scene: Scene, laws: Sequence[Law], layers: int) -> bool:
 
 @ti.func
 def relax_volume(group: ti.template(), grid: ti.template(), last: ti.template(), p: int, x: ti.template(), time: float):
-    """Relax the volume of particle p, at x, towards what the nodes hold, over a time, s.
+    """Relax the volume of particle p, at x, towards the density on the grid, over a time, s.
 
-    Returns the change of the logarithm of its volume, without sign, as far as it changes its stiffness.
+    Returns the absolute change of the logarithm of its volume, as far as it changes its stiffness.
     """
     row = group.row(p)
-    # Fraction of a cell that a node's mass fills, or its volume where nodes keep that.
+    # Factor from the mass of a node, or from its volume if nodes store it, to the filled fraction of a cell.
     scale = row[VOLUME] / row[MASS]
     if ti.static(grid.keeps_filling):
         scale = 1.0
@@ -240,12 +240,12 @@ def relax_volume(group: ti.template(), grid: ti.template(), last: ti.template(),
 
 @ti.func
 def held_around(x: ti.template(), grid: ti.template(), last: ti.template()):
-    """Return the weighted mean over the stencil of a point of what nodes hold after P2G, and the smallest of them.
+    """Return the weighted mean and the minimum, over the stencil of a point, of the nodal mass or volume after P2G.
 
-    It is the mass, kg, or where nodes keep the volume scattered to them that, m^3.
+    It is the mass, kg, or the volume, m^3, if nodes store the volume scattered to them.
     """
     d = ti.static(grid.dimension)
-    # Nodes inside a wall, and behind it, that particles beyond them reach.
+    # Number of nodes beyond a wall that stencils of particles inside reach, and of nodes inside with such images.
     reach = ti.static(grid.scheme.spline.nodes - 2)
     base, distance = grid.scheme.spline.stencil(x, grid.inverse_spacing)
     w = grid.scheme.spline.weights(distance)
@@ -261,7 +261,7 @@ def held_around(x: ti.template(), grid: ti.template(), last: ti.template()):
                 near_wall = near_wall or base[a] + 1 + 2 * reach >= last[a]
     mean, least = 0.0, 1e30
     if near_wall:
-        # Not unrolled, as below: copies of the sum over images would take half of the compile time of a 3D scene.
+        # Not unrolled: copies of the sum over images would take half of the compile time of a 3D scene.
         for q in range(ti.static(grid.scheme.spline.nodes**d)):
             node, rest, weight = base, q, 1.0
             for b in ti.static(range(d)):
@@ -275,10 +275,11 @@ def held_around(x: ti.template(), grid: ti.template(), last: ti.template()):
             mean += held * weight
             least = ti.min(least, held)
     else:
-        # All numbers of a node at once, which the compiler turns into vector instructions.
+        # All numbers of a node at once, which the compiler vectorises.
         total = ti.Vector.zero(float, grid.holding.n)
         smallest = grid.holding[first]
-        # Lines of nodes in a loop: few steps relax, and copies would take a tenth of the compile time of a 3D scene.
+        # A loop over lines of nodes: few steps relax, and unrolled copies would take a tenth of the compile time of a
+        # 3D scene.
         for line in range(ti.static(grid.scheme.spline.nodes ** (d - 1))):
             node, line_weight, at = first, 1.0, base
             for a in ti.static(range(d - 1)):
@@ -302,7 +303,7 @@ def held_around(x: ti.template(), grid: ti.template(), last: ti.template()):
 
 @ti.func
 def held_beside(x: ti.template(), grid: ti.template(), last: ti.template()):
-    """Return the least that the nodes beside the stencil of a point hold, two along each axis."""
+    """Return the smallest nodal mass or volume among the nodes beside the stencil of a point, two along each axis."""
     d = ti.static(grid.dimension)
     base, _ = grid.scheme.spline.stencil(x, grid.inverse_spacing)
     least = 1e30
@@ -312,7 +313,7 @@ def held_beside(x: ti.template(), grid: ti.template(), last: ti.template()):
         for b in ti.static(range(d)):
             node[b] += ti.select(side // 2 == b, offset, 1)
             if ti.static(b in grid.period.axes):
-                # The grid may end here, but not at its image.
+                # The node may be outside the grid; its image is inside.
                 if node[b] < PAD:
                     node[b] += last[b] - PAD
                 elif node[b] >= last[b]:
@@ -327,7 +328,7 @@ def held_beside(x: ti.template(), grid: ti.template(), last: ti.template()):
                     node[b] = 2 * last[b] - node[b]
                 if node[b] == last[b]:
                     share *= 2.0
-            # Nodes that are not in use hold what was there before.
+            # Nodes that are not in use hold old values.
             used = used and node[b] >= grid.box[0, b] and node[b] < grid.box[0, b] + grid.box[1, b]
         held = 0.0
         if used:
@@ -343,9 +344,10 @@ def held_beside(x: ti.template(), grid: ti.template(), last: ti.template()):
 
 @ti.func
 def mirrored_sum(node: ti.template(), grid: ti.template(), last: ti.template(), reach: ti.template()):
-    """Return what a node and its images behind walls and periodic faces hold; one on a wall, half outside, twice.
+    """Return the mass or volume of a node plus its images beyond walls and periodic faces.
 
-    All walls mirror here, those that have let go, and those that set velocities to zero, too.
+    A node on a wall, whose cell is half outside, counts twice. All walls mirror here, including separating walls and
+    walls that set velocities to zero.
     """
     d = ti.static(grid.dimension)
     total = 0.0
@@ -365,9 +367,11 @@ def mirrored_sum(node: ti.template(), grid: ti.template(), last: ti.template(), 
 def image_along(
     j: int, axis: ti.template(), grid: ti.template(), last: ti.template(), reach: ti.template(), n: ti.template()
 ):
-    """Return the image of node j behind the faces of an axis, itself where it has none, and whether it has one.
+    """Return the image of node j beyond the faces of an axis, or j if it has none, and whether it has one.
 
-    reach: of the nodes inside a wall, those that have images; n: nodes in a cell.
+    Args:
+        reach: number of nodes inside a wall that have images.
+        n: nodes per cell.
     """
     image, exists = j, True
     first, end = ti.static(PAD * n), last[axis] * n
