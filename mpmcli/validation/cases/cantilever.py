@@ -67,7 +67,7 @@ RAMP, WINDOW, FRAMES_PER_PERIOD = 3, 2, 24
 # Extent of the domain beyond the beam, m; the beam lies from 0 to its thickness, and its tip sinks by 1.5 m.
 RIGHT, BELOW, ABOVE = 1.0, 3.0, 1.0
 TIP = "Distance of the tip from that of Reissner's beam, over its displacement."
-THIN = Measure("deflection against thin: Deflection of the tip over that of a beam without shear and stretch, less 1.")
+THIN = Measure("deflection against thin: Deflection of the tip over that of a beam without shear and stretch, minus 1.")
 
 
 class Cantilever(Case):

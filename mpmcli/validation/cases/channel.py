@@ -100,7 +100,7 @@ def channel_measures(bound: Callable[[int], float], order: float | None = None) 
     text = "L2 error of the velocity in the middle, over the velocity."
     return (
         Measure(f"velocity error: {text}", bound, order=order, expected=2.0),
-        Measure("flow error: Flow through the middle over the exact one, less 1.", bound, expected=2.0),
+        Measure("flow error: Flow through the middle over the exact one, minus 1.", bound, expected=2.0),
         Measure("cross flow: Largest velocity across the channel, over the largest along it.", 1e-4),
     )
 

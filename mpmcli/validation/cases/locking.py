@@ -69,8 +69,8 @@ class Punch(Case):
     levels = {"coarse": (4, 8), "default": (8, 16), "fine": (8, 16, 32)}  # noqa: RUF012
     measures = (
         Measure(
-            f"load: Load on the punch over its width and (2 + pi) c, less 1: mean over the last {LOOKED_AT:.0%} of its "
-            "travel.",
+            f"load: Load on the punch over its width and (2 + pi) c, minus 1: mean over the last {LOOKED_AT:.0%} of "
+            "its travel.",
             lambda n: 1.4 / n,
             order=0.6,
         ),
