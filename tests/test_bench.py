@@ -206,7 +206,7 @@ def test_the_comparison() -> None:
 @pytest.mark.usefixtures("clocks")
 def test_what_is_not_sound_or_not_the_same_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(compare, "Peer", lambda *_: Clock(0.2))
-    assert "Beware: at 2d-64 mpm88 lost a particle" in run_here("bench", "--seconds", "0.8").stdout
+    assert "Warning: at 2d-64 mpm88 lost a particle" in run_here("bench", "--seconds", "0.8").stdout
     monkeypatch.setattr(Clock, "particles", 8)
     done = run_here("bench", "--seconds", "0.8")
     assert done.status == 1 and "mpmcli runs 8 particles instead of 7" in done.stderr

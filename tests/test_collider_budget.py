@@ -102,7 +102,7 @@ def test_plot_draws_the_force_on_each_collider(tmp_path: Path) -> None:
             post, rod = (line.get_xydata() for line in panels[title].lines[:2])
             assert [line.get_label() for line in panels[title].lines[:2]] == ["post", "rod"]
             assert np.allclose(post[:, 1], FORCES[1:, 0, axis]) and np.allclose(rod[:, 1], FORCES[1:, 1, axis])
-            assert panels[title].get_ylabel().replace("\n", " ") == "mean since the frame before, N/m"
+            assert panels[title].get_ylabel().replace("\n", " ") == "mean since the previous frame, N/m"
     written(tmp_path / "bare", [])
     with drawn(tmp_path / "bare") as panels:
         assert not any("colliders" in title for title in panels)

@@ -55,7 +55,7 @@ def test_the_panels_show_the_numbers_of_the_ledger(result):
             "Change of total energy",
             "Impulse of the walls",
             "Angular momentum",
-            "Time step, by what bounds it",
+            "Time step, by limit",
             "Courant number",
             "Volume ratio J",
             "Largest speed",
@@ -95,7 +95,7 @@ def test_the_walls_gave_what_gravity_does_not_explain(tmp_path, dimension):
 
 def test_each_time_between_frames_has_the_colour_of_what_bounds_its_steps(result):
     with drawn(result) as panels:
-        axes = panels["Time step, by what bounds it"]
+        axes = panels["Time step, by limit"]
         boxes = {entry.get_label(): entry for entry in axes.collections}
         assert set(boxes) == set(LIMITS) and axes.get_yscale() == "log"
         assert len({tuple(entry.get_facecolor()[0]) for entry in boxes.values()}) == len(LIMITS)
@@ -144,7 +144,7 @@ def test_numbers_that_are_not_finite_are_gaps_and_told(tmp_path):
     with drawn(directory) as panels:
         kinetic = line(panels["Energy"], "kinetic")[:, 1]
         assert np.flatnonzero(np.isnan(kinetic)).tolist() == [2]
-        assert len(panels["Time step, by what bounds it"].collections) == 3
+        assert len(panels["Time step, by limit"].collections) == 3
         # The momentum that is given by the walls is known again after the gap.
         assert np.flatnonzero(np.isnan(line(panels["Impulse of the walls"], "y")[:, 1])).tolist() == [2, 4]
     outcome = run_here("plot", directory, *SIZE)

@@ -72,8 +72,8 @@ def test_threads_that_the_user_has_set_are_left_alone(tmp_path, monkeypatch):
         ("input", InputError, r"^Frame 3 is damaged\.$"),
         ("run", RunError, r"^The disk is full\.$"),
         ("fault", KeyError, r"^'nothing'"),
-        ("killed", RunError, r"^A process that rendered frames was ended, or crashed; frames that are done are kept"),
-        ("exit", RunError, r"^A process that rendered frames was ended, or crashed; frames that are done are kept"),
+        ("killed", RunError, r"^A process that rendered frames was killed or crashed. Finished frames are kept"),
+        ("exit", RunError, r"^A process that rendered frames was killed or crashed. Finished frames are kept"),
     ],
 )
 def test_what_goes_wrong_in_a_process_arrives_here(tmp_path, trouble, error, sentence):

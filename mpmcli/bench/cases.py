@@ -8,7 +8,7 @@ import numpy as np
 DENSITY = 1.0
 BULK_MODULUS = 400.0
 GRAVITY = 9.8
-# Initial downward speed of mpm88, here of every block: particles change cells, and sorting is part of the step.
+# Initial downward speed of mpm88, here of every block: particles change cells, so that steps include sorting.
 SPEED = 1.0
 # Lower corner and edge of the block in the example mpm88; mpm3d starts at 0.15, with the same edge.
 CORNER = 0.2
@@ -17,7 +17,7 @@ EDGE = 0.4
 
 @dataclass(frozen=True)
 class BenchCase:
-    """One size for all workers: cells along an edge, a power of two for mpm3d, particles, and time step, s."""
+    """One size for all workers: cells along an edge (a power of two for mpm3d), particles, and time step, s."""
 
     dimension: int
     cells: int
@@ -43,7 +43,7 @@ class BenchCase:
         return np.array([0.0, -SPEED, 0.0][: self.dimension])
 
     def scene(self, body: dict, gravity: float, precision: str) -> dict:
-        """Return a body in the unit box as the dictionary of a scene file."""
+        """Return the dictionary of a scene file with a body in the unit box."""
         d = self.dimension
         domain = {"size": [1.0] * d, "cells": [self.cells] * d, "gravity": [0.0, -gravity, 0.0][:d]}
         return {
@@ -55,8 +55,8 @@ class BenchCase:
         }
 
 
-# Steps are the examples' own where they give one: 4e-4, 2e-4, 8e-5 at 32, 64, 128 cells for mpm3d,
-# 2e-4 at 128 for mpm88. Particles are about 4 per cell; at the smallest size in 2D 8, in 3D 2.
+# Steps are those of the examples where given: 4e-4, 2e-4, 8e-5 at 32, 64, 128 cells for mpm3d, 2e-4 at 128 for mpm88.
+# There are about 4 particles per cell; at the smallest size 8 in 2D and 2 in 3D.
 CASES = (
     BenchCase(dimension=2, cells=64, particles=5_000, step=4e-4),
     BenchCase(dimension=2, cells=128, particles=10_000, step=2e-4),

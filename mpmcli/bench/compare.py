@@ -1,4 +1,4 @@
-"""The falling block of mpmcli, of the example of the taichi package, and in C."""
+"""The falling block in mpmcli, in the example of the taichi package, and in C."""
 
 import statistics
 from collections.abc import Callable, Iterable, Sequence
@@ -13,13 +13,13 @@ from mpmcli.bench.worker import Side, run_block
 from mpmcli.errors import RunError
 from mpmcli.plain_text import counted, text_table
 
-# Duration of the first block, s, which is not measured: the remaining kernels compile.
+# Duration of the first block, s, in which the remaining kernels compile. It is not measured.
 WARM_UP = 0.3
 IN_C = "C"
 FRAME_NUMBERS = (
     "M steps/s: million particle-steps per second, median of the blocks; on one thread by processor time.",
-    "threads: of mpmcli, which takes one for each 2,500 particles, and of the peer. C: the yardstick.",
-    "ratio: to the peer, with its range over neighbouring blocks; slower: than C. start, compile: mpmcli, s.",
+    "threads: of mpmcli, at most one per 2,500 particles, and of the peer. C: the yardstick.",
+    "ratio: speed over the peer's, and its range over blocks; slower: time over that of C; start, compile: mpmcli, s.",
 )
 
 
@@ -33,7 +33,7 @@ def run_bench(
 ) -> dict:
     """Measure every case on each number of threads, all sides in turn (A B C A B C), and return the record.
 
-    RunError: a side cannot run, or has other particles.
+    Raises RunError if a side cannot run, or has a different number of particles.
     """
     rows = []
     for case in cases:
@@ -73,7 +73,7 @@ def _run_case(case: BenchCase, threads: int, arch: str, seconds: float, blocks: 
 
 
 def bench_table(record: dict) -> str:
-    """Return the record as text: one line per case and number of threads, then what the columns mean."""
+    """Return the record as text: one line per case and number of threads, then the meaning of the columns."""
     rows, notes = [], list(FRAME_NUMBERS)
     for case in record["cases"]:
         sides = case["sides"]
@@ -84,7 +84,7 @@ def bench_table(record: dict) -> str:
         slower = f"{ours['ns_per_particle_step'] / in_c['ns_per_particle_step']:.2f}" if in_c else ""
         rows.append([*row, _rate(in_c), slower, f"{ours['start_s']:.1f}", f"{ours['compile_s']:.1f}"])
         broken = [name for name, side in sides.items() if not side["sound"]]
-        notes += [f"Beware: at {case['case']} {name} lost a particle, or took other steps." for name in broken]
+        notes += [f"Warning: at {case['case']} {name} lost a particle, or took different steps." for name in broken]
     head = ["case", "peer", "particles", "threads", "M steps/s", "peer's", "ratio", "C", "slower", "start", "compile"]
     return page(record["machine"], record["arch"], text_table(head, rows, left={0, 1}), notes)
 

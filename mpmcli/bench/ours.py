@@ -1,4 +1,4 @@
-"""The workers of mpmcli: the falling block, and the column of a law."""
+"""The workers of mpmcli: the falling block, and a column of each law."""
 
 from collections import Counter
 from dataclasses import replace
@@ -11,9 +11,9 @@ from mpmcli.materials.registry import laws, parameter_models
 from mpmcli.scene import BodyParticles, estimate_particles, parse_scene, sample_bodies
 from mpmcli.scene.material import Knob, MaterialParameters
 
-# Of a step that results from the division of an interval into equal steps.
+# Relative error of a step that results from dividing an interval into equal steps.
 ROUND_OFF = 1e-6
-# The column: parameters by the names that laws share, so that a new law needs no entry. Strengths are well below the
+# Parameters of the column by the names that laws share, so that a new law needs no entry. Strengths are well below the
 # stress of the weight (up to 7 kPa) and of the impact (about 20 kPa), so that plastic laws flow.
 VALUES = {
     "density": 1000.0,
@@ -24,12 +24,12 @@ VALUES = {
     "consistency": 10.0,
     "friction_angle": 35.0,
 }
-# Gravity, m/s^2; downward speed at the start, m/s; dv_x/dy, 1/s; edges, and height above the floor, in a unit box.
+# Gravity, m/s^2; initial downward speed, m/s; dv_x/dy, 1/s; edges, and height above the floor, in a unit box.
 COLUMN_GRAVITY, COLUMN_SPEED, SHEAR = 9.81, 1.0, 10.0
 EDGES = {2: (0.75, 0.75), 3: (0.25, 0.5, 0.25)}
 CLEARANCE = 1 / 32
-# A fifth or less of the step that the stiffness at rest allows leaves room for hardening and impact. The particles are
-# 4 (2D) and 8 (3D) per cell, as scenes have by default.
+# Steps are at most a fifth of the stable step at rest, which leaves room for hardening and impact. There are 4 (2D) and
+# 8 (3D) particles per cell, the default of scenes.
 COLUMNS = (
     BenchCase(dimension=2, cells=128, particles=36_864, step=4e-5),
     BenchCase(dimension=3, cells=64, particles=65_536, step=1e-4),
@@ -37,7 +37,7 @@ COLUMNS = (
 
 
 def falling_block(case: BenchCase, precision: str = "f32") -> tuple[dict, list[BodyParticles]]:
-    """Return the block of the peer as the dictionary of a scene file, and its particles, with equal shares of it."""
+    """Return the block of the peer as the dictionary of a scene file, and its particles, of equal volumes."""
     d = case.dimension
     body = {
         "name": "block",
@@ -58,7 +58,7 @@ def falling_block(case: BenchCase, precision: str = "f32") -> tuple[dict, list[B
 
 
 def column(law: str, case: BenchCase) -> dict:
-    """Return the column of a law, which lands, shears and collapses, as the dictionary of a scene file."""
+    """Return the dictionary of a scene file with a column of a law, which lands, shears and collapses."""
     d, edges = case.dimension, EDGES[case.dimension]
     lower = [CLEARANCE if axis == 1 else (1 - edge) / 2 for axis, edge in enumerate(edges)]
     body = {
@@ -73,7 +73,7 @@ def column(law: str, case: BenchCase) -> dict:
 
 
 def material_of(model: type[MaterialParameters]) -> dict[str, object]:
-    """Return the material of a law: VALUES, then the middle of knobs, then defaults; RunError: there is none."""
+    """Return the material of a law: VALUES, else the middle of knobs, else defaults; RunError if there is none."""
     law = model.model_fields["law"].default
     material: dict[str, object] = {"law": law}
     for name, field in model.model_fields.items():
@@ -91,7 +91,7 @@ class Ours:
     """A run of a scene as `mpmcli simulate` computes it."""
 
     def __init__(self, data: dict, particles: list[BodyParticles] | None, threads: int, arch: str = "cpu") -> None:
-        """Put the scene on the device, with these particles, one entry per body, in place of its own sampling."""
+        """Build the scene on the device; `particles`, one entry per body, replace the sampling of the scene."""
         from mpmcli.solver.engine.batch import Batch
         from mpmcli.solver.engine.compiled_kind import CompiledKind
         from mpmcli.solver.engine.run import Run
@@ -105,7 +105,7 @@ class Ours:
             backend = replace(backend, threads=useful_threads(count, threads))
         start(backend)
         bodies = particles or sample_bodies(scene)
-        # Kernels of steps that bodies set themselves: those of a benchmark are short, and would keep motion.
+        # Compile for automatic steps: with the short steps of a benchmark the kernels would keep motion.
         usual = scene.model_copy(update={"time": scene.time.model_copy(update={"step": "auto"})})
         batch = Batch(CompiledKind.of(usual, bodies).padded(), backend)
         self.run = Run(batch, 0, scene, bodies, force=particles is not None)
@@ -113,7 +113,7 @@ class Ours:
         self.step = self._smallest = data["time"]["step"]
 
     def advance(self, count: int) -> int:
-        """Take about `count` steps and return how many."""
+        """Take about `count` steps and return their number."""
         steps, smallest = self.run.advance(count)
         self._smallest = min(self._smallest, smallest)
         return steps
@@ -126,19 +126,19 @@ class Ours:
         return self.run.frame()[0].position
 
     def is_sound(self) -> bool:
-        """Whether every particle is in the domain, and every step was that of the case."""
+        """Return whether every particle is in the domain and every step had the length of the case."""
         places = [group.arrays.x.to_numpy() for group in self.run.groups]
         inside = all(bool(((position >= 0) & (position <= 1)).all()) for position in places)
         return inside and self._smallest > (1 - ROUND_OFF) * self.step
 
 
 def block_of_ours(case: BenchCase, threads: int, arch: str = "cpu", precision: str = "f32") -> Ours:
-    """Return mpmcli on the block of the peer."""
+    """Return the worker of mpmcli for the block of the peer."""
     return Ours(*falling_block(case, precision), threads, arch)
 
 
 class ProfiledColumn(Ours):
-    """The column of a law, whose phases are launched one by one, and timed."""
+    """The column of a law, with phases that are launched and timed separately."""
 
     def __init__(self, law: str, case: BenchCase, threads: int) -> None:
         super().__init__(column(law, case), None, threads)

@@ -1,10 +1,10 @@
 """The other workers: MPM examples of the taichi package, and the yardstick, the same block in C.
 
 Examples are read from the installed files. Only settings change: backend, threads, precision, grid, particles and step.
-The window at the end of each is left out. Every line that is changed must be found exactly once, so that another
-version of the package is noticed rather than measured wrongly.
+The code of the window at the end is omitted. Each changed line must occur exactly once, so that another version of the
+package is an error and not a wrong measurement.
 
-The yardstick is compiled where gcc is, and tells how far the limit of a processor is.
+The yardstick is compiled if gcc is available. It shows the distance of mpmcli from the limit of the processor.
 """
 
 import ctypes
@@ -26,7 +26,7 @@ from mpmcli.errors import RunError
 
 @dataclass(frozen=True)
 class Example:
-    """How an example is adapted: changed lines, where `drawing` begins, and names of its fields."""
+    """Adaptation of an example: changed lines, the line at which `drawing` begins, and names of its fields."""
 
     changes: dict[str, str]
     drawing: str
@@ -55,7 +55,7 @@ EXAMPLES = {
 }
 _INIT = "ti.init(arch=ti.gpu)"
 YARDSTICK = Path(__file__).with_name("yardstick.c")
-# Those of -ffast-math but without it: a library linked with that flushes denormal numbers of its process to zero.
+# The options of -ffast-math one by one: a library linked with -ffast-math flushes denormals of its process to zero.
 FAST_MATH = (
     *("-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-fassociative-math", "-freciprocal-math"),
     "-ffinite-math-only",
@@ -63,7 +63,7 @@ FAST_MATH = (
 FLAGS = ("-O3", "-march=native", *FAST_MATH, "-fopenmp", "-std=gnu11", "-shared", "-fPIC")
 # Phases in the order of the source; P2G includes clearing.
 PHASES = ("sort", "p2g", "grid", "g2p")
-# Share of a cell by which a particle may be behind a wall: velocities are zero on nodes alone.
+# Fraction of a cell by which a particle may be behind a wall: velocities are zero only on nodes.
 BEHIND = 0.5
 
 
@@ -79,7 +79,7 @@ def example_path(name: str) -> Path:
 
 
 def adapted_source(text: str, case: BenchCase, threads: int, arch: str, precision: str) -> str:
-    """Return an example with its settings and without its drawing; RunError: a line is not there exactly once."""
+    """Return an example with new settings and without drawing. Raises RunError if a line does not occur once."""
     example = EXAMPLES[case.peer]
     options = f"arch=ti.{arch}, default_fp=ti.{precision}, cpu_max_num_threads={threads}, offline_cache=False"
     lines = text.splitlines()
@@ -93,7 +93,7 @@ def _only_line(lines: list[str], wanted: str, name: str) -> int:
     if len(found) != 1:
         raise RunError(
             f"The example {name} of the installed taichi package has the line `{wanted}` {len(found)} times "
-            "instead of once, so it cannot be measured; taichi 1.7.4 has the example that is expected."
+            "instead of once, so it cannot be measured; the expected example is that of taichi 1.7.4."
         )
     return found[0]
 
@@ -134,7 +134,7 @@ class Peer:
         return self._position.to_numpy()
 
     def is_sound(self) -> bool:
-        """Whether every particle is in the domain."""
+        """Return whether every particle is in the domain."""
         position = self.positions()
         return bool(((position > 0) & (position < 1)).all())
 
@@ -145,7 +145,7 @@ def has_compiler() -> bool:
 
 
 def load_yardstick(dimension: int) -> ctypes.CDLL:
-    """Compile the yardstick for a dimension in a temporary directory, and load it."""
+    """Compile the yardstick for a dimension in a temporary directory, and load it. Raises RunError on failure."""
     with tempfile.TemporaryDirectory() as folder:
         library = Path(folder) / "yardstick.so"
         command = ["gcc", *FLAGS, f"-DD={dimension}", "-o", str(library), str(YARDSTICK)]
@@ -170,7 +170,7 @@ def load_yardstick(dimension: int) -> ctypes.CDLL:
 
 
 class Yardstick:
-    """A block of fluid, in f32, between walls that slip."""
+    """A block of fluid in C, in f32, between slip walls."""
 
     def __init__(
         self,
@@ -182,7 +182,7 @@ class Yardstick:
     ) -> None:
         """Compile, and put particles, (particles, dimension), by default those of the case, into a unit box.
 
-        The fluid may take tension. RunError: gcc fails, or the memory does not suffice.
+        With `tension` the fluid bears tension. Raises RunError if gcc fails or the memory does not suffice.
         """
         position = case.positions() if position is None else position
         velocity = np.tile(case.velocity(), (case.particles, 1)) if velocity is None else velocity
@@ -198,7 +198,7 @@ class Yardstick:
             case.particles, case.cells, threads, tension, *numbers, *(array.ctypes.data for array in arrays)
         )
         if not self._handle:
-            raise RunError(f"The memory does not suffice for {case.particles} particles in the yardstick.")
+            raise RunError(f"There is not enough memory for {case.particles} particles in the yardstick.")
 
     def advance(self, count: int) -> int:
         """Take `count` steps."""
@@ -206,7 +206,7 @@ class Yardstick:
         return count
 
     def sync(self) -> None:
-        """Do nothing: every step waits."""
+        """Do nothing: `advance` returns when its steps are done."""
 
     def phases(self) -> dict[str, float]:
         """Return the time in each of PHASES since the last call, s: processor time on one thread, else wall time."""
@@ -222,6 +222,6 @@ class Yardstick:
         return position, velocity
 
     def is_sound(self) -> bool:
-        """Whether every particle is in the box, or less than BEHIND cells behind a wall."""
+        """Return whether every particle is in the box, or less than BEHIND cells behind a wall."""
         position, beyond = self.state()[0], BEHIND * self._spacing
         return bool(((position > -beyond) & (position < 1 + beyond)).all())

@@ -1,4 +1,4 @@
-"""What the phases of a step take, for each law, and in C: sort, P2G, grid, G2P, volumes, and measuring the state."""
+"""Time of the phases of a step for each law, and in C: sort, P2G, grid, G2P, volumes, and measuring the state."""
 
 import statistics
 from collections.abc import Callable, Iterable
@@ -14,26 +14,26 @@ from mpmcli.bench.worker import Side, run_block
 from mpmcli.materials.registry import laws
 from mpmcli.plain_text import text_table
 
-# Columns of the table, by the names that phases have in the solver and in C; all others are of the grid.
+# Columns of the table by the names of the phases in the solver and in C; all other phases count as grid.
 COLUMN_OF = {name: name for name in ("sort", "p2g", "g2p", "measure")}
 COLUMN_OF |= {"scatter": "p2g", "advance": "g2p", "average": "volumes", "relax": "volumes"}
 IN_C = "fluid in C"
 COLUMNS = ("sort", "p2g", "grid", "g2p", "volumes", "measure", "rest", "total")
-# Start of the measured interval, s. The wave of the impact, at about 25 m/s, is then inside the column, which leans and
-# spreads; nothing is at rest.
+# Start of the measured interval, s. The wave of the impact, at about 25 m/s, is then inside the column, which shears
+# and spreads; no part of it is at rest.
 SETTLING = 0.05
 FRAME_NUMBERS = (
-    "ns per particle and step, median of the blocks, wall time, of steps whose phases are launched one by one: the",
-    "kernel of mpmcli simulate has the same functions without launches between them. P2G and G2P contain the law.",
-    "grid: clearing, and the update of nodes; volumes: their relaxation, or average; measure: for the limits of",
-    "steps; rest: launches, and what the host does between them.",
+    "ns per particle and step: median of the blocks, wall time. Each phase is launched separately; the kernel of",
+    "mpmcli simulate calls the same functions without launches between them. P2G and G2P include the law.",
+    "grid: clearing and update of the nodes; volumes: relaxation or averaging of volumes; measure: quantities for",
+    "the limits of steps; rest: launches, and work of the host between them.",
 )
 
 
 def run_profile(
     cases: Iterable[BenchCase], threads: int, seconds: float, blocks: int, tell: Callable[[str], None]
 ) -> dict:
-    """Measure the phases of all laws, and of the fluid in C, one after the other; return the record."""
+    """Measure the phases of all laws, and of the fluid in C, in sequence; return the record."""
     rows = []
     for case in cases:
         makes = {law: partial(ProfiledColumn, law, case, threads) for law in sorted(laws())}
@@ -51,7 +51,7 @@ def run_profile(
 
 
 def _measured(side: Side, seconds: float, blocks: int) -> dict:
-    """Return the particles, and medians of the columns, ns per particle and step."""
+    """Return the number of particles and the medians of the columns, ns per particle and step."""
     phases = methodcaller("phases")
     side.ask(phases)
     found: list[dict[str, float]] = []

@@ -1,4 +1,4 @@
-"""The machine of a benchmark, and what stands around its tables."""
+"""The machine of a benchmark, and the page around its tables."""
 
 import importlib.metadata
 import os
@@ -10,7 +10,7 @@ from mpmcli import __version__
 
 
 def describe_machine() -> dict:
-    """Return processor, system and versions."""
+    """Return the processor, the system and the versions."""
     return {
         "processor": _processor_name(),
         "logical_processors": os.cpu_count(),

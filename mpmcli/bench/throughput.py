@@ -1,7 +1,7 @@
-"""How many trajectories of a sweep one worker and all workers compute and store, alternately (A B A B).
+"""Throughput of a sweep: trajectories that one worker and all workers compute and store, alternately (A B A B).
 
-The sweep is a block of dry sand thrown about in a closed square, the scene of the GNS project's generator: 64 x 64
-cells, 1,444 particles, and 350 frames of 2.5 ms.
+The sweep is a block of dry sand thrown in a closed square, the scene of the GNS project's generator: 64 x 64 cells,
+1,444 particles, and 350 frames of 2.5 ms.
 """
 
 import statistics
@@ -21,17 +21,17 @@ from mpmcli.dataset.sweep_run import SweepSettings, SweepState, run_sweep
 from mpmcli.materials.registry import parameter_models
 from mpmcli.plain_text import text_table
 
-# Trajectories of the first sweep, which is not measured: it compiles the kernels, and gives the time of a trajectory.
+# Trajectories of the first sweep, which compiles the kernels and gives the time of a trajectory. It is not measured.
 WARM_UP = 4
 # Length of a block of the peer, s.
 PEER_SECONDS = 2.0
-# The generator of the GNS project takes this processor time, s, for a trajectory on one core, measured on a machine
-# where mpm88, with the particles and cells of the case 2d-64 and on two threads, made so many particle-steps/s. Their
-# product carries the time over to the present machine.
+# Processor time, s, of the GNS project's generator for a trajectory on one core, and the rate of mpm88 on the same
+# machine, particle-steps/s, with the particles and cells of the case 2d-64 and two threads. Their product converts the
+# time to the present machine.
 GENERATOR_SECONDS = 8.4
 GENERATOR_PEER_RATE = 6.5e6
 PEER_THREADS = 2
-# Frames of a trajectory after the first, and the time between two of them, s.
+# Frames of a trajectory after the first, and the interval between them, s.
 FRAMES = 350
 INTERVAL = 2.5e-3
 SCENE = """\
@@ -50,7 +50,7 @@ material = {{ preset = "sand", youngs_modulus = 2.0e6, friction_angle = 30.0 }}
 shape = {{ box = {{ min = [0.35, 0.4], max = [0.65, 0.7] }} }}
 velocity = [1.0, 0.0]
 """
-# What is drawn changes neither the number of particles nor the step.
+# The varied parameters change neither the number of particles nor the step.
 SWEEP = """\
 base = "base.toml"
 count = {count}
@@ -62,7 +62,7 @@ seed = 1
 
 
 def sand_sweep(directory: Path, count: int, frames: int = FRAMES) -> Sweep:
-    """Write the sweep of so many trajectories and its scene to a directory, and return it."""
+    """Write a sweep of `count` trajectories and its scene to a directory, and return the sweep."""
     (directory / "base.toml").write_text(SCENE.format(end=frames * INTERVAL, frames=frames), encoding="utf-8")
     path = directory / "sweep.toml"
     path.write_text(SWEEP.format(count=count), encoding="utf-8")
@@ -74,14 +74,14 @@ def run_throughput(
 ) -> dict:
     """Compute sweeps with one worker and with all in turn, mpm88 between, and return the record for JSON.
 
-    A block takes so many seconds. RunError: the peer or a sweep failed.
+    A block takes about `seconds` s. Raises RunError if the peer or a sweep fails.
     """
     found: dict[int, list[SweepState]] = {count: [] for count in sorted({1, workers})}
     with closing(Side("mpm88", partial(Peer, CASES[0], PEER_THREADS), by_processor=False)) as peer:
         peer.measure(0.3)
         peer.blocks.clear()
         tell(f"first block, not measured: {WARM_UP} trajectories")
-        # Compiles what the sweep needs; the time of a trajectory is that after the first.
+        # Compiles the kernels of the sweep; the time of a trajectory excludes the first.
         ends: list[tuple[int, float]] = []
         _block(1, WARM_UP, frames, lambda state: ends.append((state.done, state.seconds)))
         (first, begin), (last, end) = ends[0], ends[-1]
@@ -92,7 +92,7 @@ def run_throughput(
                 states.append(_block(count, count * share, frames))
                 tell(f"round {number + 1} of {blocks}, workers: {count}: {states[-1].per_hour:,.0f} per hour")
         rate = 1e9 / peer.cost
-    # What the generator would take for a trajectory on one core of this machine.
+    # Estimated time of the generator for a trajectory on one core of this machine.
     generator = GENERATOR_SECONDS * GENERATOR_PEER_RATE / rate
     facts = {"frames": frames, "peer_particle_steps_per_s": rate, "generator_s": generator}
     results = [_result(count, states, generator) for count, states in found.items()]
@@ -109,7 +109,7 @@ def _block(
 
 
 def _result(workers: int, states: list[SweepState], generator: float) -> dict:
-    """Return what the blocks of one number of workers tell; ratios are to a generator process for each."""
+    """Return the results for one number of workers; ratios are to one generator process per worker."""
     rates = [state.per_hour for state in states]
     return {
         "workers": workers,
@@ -123,7 +123,7 @@ def _result(workers: int, states: list[SweepState], generator: float) -> dict:
 
 
 def throughput_table(record: dict) -> str:
-    """Return the record of the sweeps as text: one line per number of workers, then what the columns mean."""
+    """Return the record of the sweeps as text: one line per number of workers, then the meaning of the columns."""
     rows = []
     for row in record["results"]:
         low, high = min(row["ratio_blocks"]), max(row["ratio_blocks"])
@@ -132,10 +132,10 @@ def throughput_table(record: dict) -> str:
         rows.append([*cells, f"{row['trajectories_per_hour']:,.0f}", f"{row['ratio']:.1f} ({low:.1f} to {high:.1f})"])
     head = ["workers", "accepted", "s per core", "per hour", "ratio"]
     notes = (
-        "per hour: trajectories computed and stored, once every worker has ended a task; median of the blocks.",
-        f"ratio: to the GNS project's generator on each core, {record['generator_s']:.1f} s for a trajectory: it took",
-        f"{GENERATOR_SECONDS} s where mpm88 at 2d-64 on {PEER_THREADS} threads made {GENERATOR_PEER_RATE / 1e6:.1f}",
-        f"million particle-steps/s; here mpm88 makes {record['peer_particle_steps_per_s'] / 1e6:.2f}.",
+        "per hour: trajectories computed and stored, after every worker has ended a task; median of the blocks.",
+        f"ratio: to the GNS project's generator on each core, {record['generator_s']:.1f} s per trajectory. It took",
+        f"{GENERATOR_SECONDS} s where mpm88 at 2d-64 on {PEER_THREADS} threads reached {GENERATOR_PEER_RATE / 1e6:.1f}",
+        f"million particle-steps/s; here mpm88 reaches {record['peer_particle_steps_per_s'] / 1e6:.2f}.",
     )
     what = f"cpu, a block of sand: 1,444 particles, 64 x 64 cells, {record['frames']} frames"
     return page(record["machine"], what, text_table(head, rows, left=set()), notes)

@@ -1,4 +1,4 @@
-"""A worker of a benchmark: a simulation in a process of its own, that steps when it is asked to."""
+"""A worker of a benchmark: a simulation in a separate process that steps on request."""
 
 import multiprocessing
 import os
@@ -20,31 +20,31 @@ class Worker(Protocol):
     threads: int
 
     def advance(self, count: int) -> int:
-        """Take about `count` time steps and return how many; may return before the device is done."""
+        """Take about `count` time steps and return their number; may return before the device is done."""
 
     def sync(self) -> None:
         """Wait until every requested step is done."""
 
     def is_sound(self) -> bool:
-        """Whether every particle is in the domain, and every step was that of the case."""
+        """Return whether every particle is in the domain and every step had the length of the case."""
 
 
 def run_block(worker: Worker, seconds: float) -> tuple[int, float, float]:
-    """Step once, and on for about `seconds`; return (steps, seconds taken, of processor time), device included."""
+    """Step at least once, for about `seconds`; return (steps, wall time, processor time), s, device included."""
     steps, chunk, elapsed = 0, 1, 0.0
     begin, busy = time.perf_counter(), time.process_time()
     while steps == 0 or elapsed < seconds:
         steps += worker.advance(chunk)
         worker.sync()
         elapsed = time.perf_counter() - begin
-        # Few waits for the device, and no overshoot: grow until what is left limits the next chunk.
+        # Few waits for the device and no overshoot: chunks double until the remaining time limits the next one.
         chunk = max(1, min(2 * chunk, int(steps / elapsed * (seconds - elapsed)) + 1))
     return steps, elapsed, time.process_time() - busy
 
 
 def serve(pipe: Connection, log: str, make: Callable[[], Worker]) -> None:
-    """Make a worker and apply what is asked of it, until that is None; an error is the answer, and the end."""
-    # What Taichi prints, and the last words of a crash; settings of Taichi from outside would reach only one side.
+    """Create a worker and apply the requested functions until a request is None; an MpmcliError is sent and ends it."""
+    # The log has the output of Taichi and of a crash. Taichi's environment variables would affect only one side.
     output = os.open(log, os.O_WRONLY)
     os.dup2(output, 1)
     os.dup2(output, 2)
@@ -61,12 +61,12 @@ def serve(pipe: Connection, log: str, make: Callable[[], Worker]) -> None:
 
 
 class Side:
-    """The process of a worker, and what its blocks have cost."""
+    """The process of a worker, and the costs of its blocks."""
 
     def __init__(self, name: str, make: Callable[[], Worker], *, by_processor: bool) -> None:
-        """Start what `make` makes in its process, and compile the kernels by a first step; RunError: it cannot.
+        """Start the worker of `make` in its process, and compile the kernels with a first step.
 
-        Costs are processor time, which excludes other processes, or wall time.
+        Costs are processor time, which excludes other processes, or wall time. Raises RunError if the worker fails.
         """
         self.name, self._by_processor = name, by_processor
         self.blocks: list[float] = []
@@ -86,12 +86,12 @@ class Side:
             raise
 
     def ask(self, act: Callable[..., Any], *arguments: object) -> Any:
-        """Return act(worker, *arguments), as its process computes it; RunError: it has failed."""
+        """Return act(worker, *arguments), computed in its process. Raises RunError if it fails."""
         self._pipe.send((act, *arguments))
         return self._answer()
 
     def measure(self, seconds: float) -> int:
-        """Measure a block, and return the number of steps; its cost, ns per particle and step, is in `blocks`."""
+        """Measure a block and return its number of steps; append its cost, ns per particle and step, to `blocks`."""
         steps, wall, processor = self.ask(run_block, seconds)
         self.blocks.append(1e9 * (processor if self._by_processor else wall) / steps / self.particles)
         return steps
@@ -102,7 +102,7 @@ class Side:
         return statistics.median(self.blocks)
 
     def facts(self) -> dict[str, Any]:
-        """Return what was measured, for JSON."""
+        """Return the measurements, for JSON."""
         return {
             "threads": self.threads,
             "ns_per_particle_step": self.cost,

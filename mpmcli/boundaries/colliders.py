@@ -1,6 +1,6 @@
-"""Colliders in kernels: what the nodes that they cover may do, where they are, and what they have taken.
+"""Colliders in kernels: constraints on the nodes that they cover, their poses, and their loads.
 
-Which colliders there are, where, and how they move are data: runs that differ in them share kernels, which know only
+The colliders, their positions and their motions are data: runs that differ in them share kernels, which depend only on
 the forms that occur (docs/theory.md, 3.8).
 """
 
@@ -21,36 +21,37 @@ from mpmcli.scene.primitives import Box, Polygon
 from mpmcli.scene.quantity import AXES
 from mpmcli.scene.surface import form_surface, surface_points
 
-# Cells outside of a surface up to which it acts on nodes: the outermost of them lies between a quarter of a cell inside
-# and three quarters outside, where fluids neither enter nor lose pressure, and what is rough sticks (docs/theory.md,
-# 3.8). A little more, so that no node is at that distance by rounding.
+# Distance in cells outside a surface up to which it acts on nodes. The outermost of these nodes lies between a quarter
+# of a cell inside and three quarters outside: then fluids neither enter nor lose pressure, and rough surfaces stick
+# (docs/theory.md, 3.8). A little more than 0.75, so that rounding does not matter for nodes at that distance.
 REACH = 0.76
-# Codes of what a surface does.
+# Codes of the conditions of surfaces.
 SLIP, STICK, SEPARATE, HOLD = range(4)
 WALLS = {"slip": SLIP, "stick": STICK, "separate": SEPARATE, "hold": HOLD}
-# Cells outside of a shape that holds, up to which it holds nodes, so that what is held ends half a cell off at most.
+# Distance in cells up to which a holding shape holds nodes outside it: the held region ends at most half a cell off.
 HELD_OUTSIDE = 0.499
-# What a surface does to a node: nothing, it takes what is normal to it and perhaps a part of the rest, or all.
+# Effect of a surface on the relative velocity of a node: none; it takes the normal part and maybe a part of the rest;
+# or it takes all.
 LOOSE, PRESSED, HELD = range(3)
 FORMS = tuple(DISTANCES)
-# Of all other forms, by their distances on a grid.
+# Code of all other forms, with distances on a grid.
 GRID = len(FORMS)
 BOX = FORMS.index(Box)
-# 2 pi in two parts, as literals have the precision of particles: the first is exact, the second 1e-10.
+# 2 pi in two parts, because literals have the precision of particles: the first is exact, the second to 1e-10.
 TURN = (6.28125, 2 * math.pi - 6.28125)
 
 
 @dataclass(frozen=True)
 class ColliderKind:
-    """What is compiled for the colliders of a run, and how much room they need."""
+    """Properties of the colliders of a run that kernels depend on, and the storage that the colliders need."""
 
     forms: tuple[int, ...]  # indices into FORMS of the forms that occur, in order, GRID among them
-    moving: tuple[int, ...]  # which of the colliders move
+    moving: tuple[int, ...]  # indices of the colliders that move
     count: int  # upper bounds: of the colliders, and of the numbers and the samples of their forms
     numbers: int
     samples: int
-    free: tuple[int, ...] = ()  # which of them move freely
-    points: int = 0  # on the surfaces of these
+    free: tuple[int, ...] = ()  # indices of the colliders that move freely
+    points: int = 0  # number of points on the surfaces of free colliders
 
     @staticmethod
     def of(scene: Scene) -> "ColliderKind":
@@ -67,14 +68,14 @@ class ColliderKind:
         )
 
     def bytes_needed(self, dimension: int, rows: int) -> int:
-        """Return the bytes that loads and distances on grids take on the device, with `rows` of nodes (last axis)."""
+        """Return the bytes of loads and distance grids on the device; `rows` of nodes are along the last axis."""
         sums = 9 if dimension == 2 else 27
         loads = Loads.bytes_needed(self.count, dimension, rows)
         points = self.points * (36 + 32 * dimension)
         return loads + 8 * rows * len(self.free) * sums + points + 4 * self.samples
 
     def joined(self, other: "ColliderKind") -> "ColliderKind | None":
-        """Return the kind that has room for both, None where they need other kernels."""
+        """Return the kind that has room for both, or None if they need different kernels."""
         if (self.moving, self.free, self.count > 0) != (other.moving, other.free, other.count > 0):
             return None
         forms = tuple(sorted({*self.forms, *other.forms}))
@@ -85,7 +86,7 @@ class ColliderKind:
 def form_code(collider: Collider) -> int:
     """Return the index of the form of a collider in FORMS, or GRID."""
     kind = type(collider.form)
-    # In the corners of a polygon around the material the normals of a grid are those of both edges.
+    # In the corners of a polygon around the material, the normals of a grid follow both edges.
     around = kind is Polygon and collider.side == "inside"
     return FORMS.index(kind) if kind in FORMS and not around else GRID
 
@@ -99,12 +100,12 @@ def numbers_of(collider: Collider, h: float) -> list[float]:
 
 
 def contact_points(collider: Collider, h: float) -> np.ndarray:
-    """Return points on the surface of one that moves freely, about its centre, (n, d), one to a cell of h metres."""
+    """Return points on the surface of a free collider, relative to its centre, (n, d), one per cell of h metres."""
     return surface_points(form_surface(collider.form), h) - np.array(collider.center)
 
 
 def reach_of(collider: Collider, h: float) -> np.ndarray:
-    """Return where nodes lie on which a collider may act, relative to its pivot, lower and upper, (2, d), m."""
+    """Return the lower and upper bounds of nodes on which a collider may act, relative to its pivot, (2, d), m."""
     d, motion = len(collider.velocity), collider.motion
     radius = np.inf if collider.side == "inside" else collider.radius
     found = np.array([[-radius] * d, [radius] * d])
@@ -120,13 +121,14 @@ class Colliders:
     """The colliders of some runs.
 
     Attributes:
-        kind: what is compiled, with the room for each run.
-        run: whose colliders act; spacing: h, m.
-        loads: what each collider takes from the material, about its pivot.
-        layered: whether some bodies meet those that separate by their surfaces; then these act here where `own` is 0,
-            a number or a variable of a kernel.
-        deterministic: whether the nodes of a row are added up in their order; then `given` is the impulse that each
-            node gives each collider in a step, N s, else None.
+        kind: the kind of the colliders, with the storage of each run.
+        run: the current run.
+        spacing: h, m.
+        loads: loads of the material on each collider, about its pivot.
+        layered: whether some bodies meet separating colliders by their surfaces; then these colliders act here only
+            if `own`, a number or a variable of a kernel, is 0.
+        deterministic: whether the nodes of a row are summed in order; then `given` is the impulse of each node on each
+            collider in a step, N s, else None.
     """
 
     def __init__(
@@ -155,13 +157,13 @@ class Colliders:
             self.samples = ti.field(ti.f32, shape=runs * kind.samples)
             self.grid_distance = GridDistance(d, self.samples)
             self.sample = ti.field(int, shape=n)
-        # Of each: form, what the surface does, first of its numbers, and -1 for a container, else 1.
+        # Of each: form, condition of the surface, index of its first parameter, and -1 for a container, else 1.
         self.form, self.wall = ti.field(int, shape=n), ti.field(int, shape=n)
         self.begin, self.side = ti.field(int, shape=n), ti.field(int, shape=n)
         self.friction = ti.field(float, shape=n)
-        # Along which axes it lets go of what it holds, 1 or 0.
+        # Axes along which a holding collider does not hold, 1 or 0.
         self.lets = ti.Vector.field(d, int, shape=n)
-        # Where the pivot is, relative to the lower corner, m, how it is turned, and the nodes that it may act on.
+        # Position of the pivot relative to the lower corner, m, rotation, and bounds of the nodes that it may act on.
         self.place = ti.Vector.field(d, float, shape=n)
         self.turned = ti.Matrix.field(d, d, float, shape=n)
         self.reach = ti.Matrix.field(2, d, float, shape=n)
@@ -213,7 +215,7 @@ class Colliders:
 
     @ti.func
     def add_row(self, q: int):
-        """Book what collider q % room has taken from the nodes of row q // room in a step, in their order."""
+        """Add the impulses on collider q % capacity from the nodes of row q // capacity in a step, in order."""
         d = ti.static(self.dimension)
         nodes = ti.static(self.shape[-1])
         k, rest = q % self.capacity, q // self.capacity
@@ -242,7 +244,7 @@ class Colliders:
 
     @ti.func
     def constrain(self, node: ti.template(), velocity: ti.template(), mass: float):
-        """Return the velocity, m/s, of a node that has a mass, kg, after the colliders, which take the rest."""
+        """Return the velocity, m/s, of a node of a mass, kg, after the colliders have acted; add to their loads."""
         d = ti.static(self.dimension)
         result, x = ti.Vector.zero(float, d), self.place_of(node)
         for a in ti.static(range(d)):
@@ -271,12 +273,12 @@ class Colliders:
 
     @ti.func
     def reach_of_surface(self, i: int):
-        """Return how far outside of its surface collider i acts on nodes, m."""
+        """Return the distance outside its surface up to which collider i acts on nodes, m."""
         return ti.select(self.wall[i] == HOLD, HELD_OUTSIDE, REACH) * self.spacing
 
     @ti.func
     def place_of(self, node: ti.template()):
-        """Return where a node is, relative to the lower corner, m."""
+        """Return the position of a node relative to the lower corner, m."""
         x = ti.Vector.zero(float, self.dimension)
         for a in ti.static(range(self.dimension)):
             x[a] = ti.cast(node[a] - self.first, float) * self.spacing
@@ -284,7 +286,7 @@ class Colliders:
 
     @ti.func
     def covers(self, i: int, x: ti.template()):
-        """Return whether collider i may act at a place."""
+        """Return whether collider i may act at a position."""
         arm, near = x - self.place[i], True
         for a in ti.static(range(self.dimension)):
             near = near and arm[a] >= self.reach[i][0, a] and arm[a] <= self.reach[i][1, a]
@@ -292,7 +294,7 @@ class Colliders:
 
     @ti.func
     def held_back(self, x: ti.template(), way: ti.template()):
-        """Return the way, m, that a particle at x may go: at most half of that to the surface of a collider."""
+        """Return the displacement `way`, m, of a particle at x, limited to half of the distance to any collider."""
         result = way
         for k in range(self.count[self.run]):
             i = self.run * self.capacity + k
@@ -304,20 +306,20 @@ class Colliders:
 
     @ti.func
     def faces_of(self, i: int):
-        """Return the number of faces of collider i that act in turn: of a box around the material one per axis.
+        """Return the number of faces of collider i that act in turn: one per axis for a box around the material.
 
-        In its edges the material meets several at once; elsewhere the nearest point of a surface says all.
+        At its edges the material touches several faces at once; elsewhere the nearest point of a surface suffices.
         """
         count = 1
         if ti.static(self.boxes):
             if self.form[i] == BOX and self.side[i] < 0:
-                # `count = ti.static(...)` would name a constant, and store nothing.
+                # `count = ti.static(...)` would define a constant, and not assign the variable.
                 count += ti.static(self.dimension - 1)
         return count
 
     @ti.func
     def distance(self, i: int, arm: ti.template(), face: int):
-        """Return the distance of a place from a face of collider i, m, and the normal into the material."""
+        """Return the distance of a position from a face of collider i, m, and the normal into the material."""
         d = ti.static(self.dimension)
         y = self.turned[i].transpose() @ arm
         phi, own = 1e30, ti.Vector.zero(float, d)
@@ -344,7 +346,7 @@ class Colliders:
 
     @ti.func
     def met(self, i: int, arm: ti.template(), normal: ti.template(), velocity: ti.template()):
-        """Return the velocity of a node that collider i covers, and what the surface does to it."""
+        """Return the velocity of a node that collider i covers, and the effect: LOOSE, PRESSED or HELD."""
         own = self.velocity[i] + self.turning[i] @ arm
         relative = velocity - own
         away = relative.dot(normal)
@@ -367,14 +369,14 @@ class Colliders:
 
 @ti.data_oriented
 class ColliderMotion:
-    """The colliders of some runs that move: where they are in a step, and how fast their points move in it.
+    """The moving colliders of some runs: their poses and velocities in a step.
 
-    A collider stands where it is at the start of a step. Its points have the mean velocity of the step, so that
-    material that moves with it keeps its place on it exactly. Sums are in double precision.
+    A collider has the pose of the start of a step. Its points have the mean velocity of the step, so that material that
+    moves with it stays in place on it exactly. Sums are in double precision.
 
     Attributes:
         moving: their indices.
-        rates: means in the step of the velocity, m/s, and the spin, rad/s: the host sets those that are constant.
+        rates: means in the step of the velocity, m/s, and the spin, rad/s. The host sets constant rates.
     """
 
     def __init__(self, colliders: Colliders, runs: int) -> None:
@@ -382,7 +384,7 @@ class ColliderMotion:
         self.colliders, self.dimension, self.moving = colliders, d, colliders.kind.moving
         n = runs * len(self.moving)
         self.rates = double_field(n, d + 1)
-        # Where the pivot is, relative to the lower corner, m, and the angle, rad.
+        # Position of the pivot relative to the lower corner, m, and the angle, rad.
         self.pose = double_field(n, d + 1)
         self.axis = double_field(n, entries=(3,))
 
@@ -397,13 +399,13 @@ class ColliderMotion:
             self.write_rates(run, m, [float(evaluate(tree, {"t": 0.0})) for tree in motion.rates])
 
     def write_rates(self, run: int, m: int, rates: Sequence[float]) -> None:
-        """Set the rates of the m-th of them in a step, d + 1 numbers."""
+        """Set the rates of the m-th moving collider in a step, d + 1 numbers."""
         for a, value in enumerate(rates):
             self.rates[run * len(self.moving) + m, a] = value
 
     @ti.func
     def advance(self, run: int, dt: ti.f64):
-        """Begin a step of dt seconds: put colliders where they are, and find where they will be."""
+        """Begin a step of dt seconds: set the poses and velocities of the colliders, and advance the poses."""
         d = ti.static(self.dimension)
         for m, k in ti.static(enumerate(self.moving)):
             row = run * ti.static(len(self.moving)) + m
@@ -422,10 +424,10 @@ class ColliderMotion:
 
     @ti.func
     def rotation(self, row: int, angle: ti.f64):
-        """Return R - I, R the rotation by an angle about the axis, d x d; formula of Rodrigues."""
+        """Return R - I, (d, d), with the rotation R by an angle about the axis, by Rodrigues' formula."""
         d = ti.static(self.dimension)
         result = ti.Matrix.zero(float, d, d)
-        # Vulkan has sines in single precision only: of a part of a turn they are as good as the result.
+        # Vulkan has sines in single precision only: for an angle within a turn they are as accurate as the result.
         turns = ti.cast(ti.cast(angle * ti.static(0.5 / math.pi), int), ti.f64)
         part = ti.cast((angle - turns * TURN[0]) - turns * TURN[1], float)
         # 1 - cos without cancellation.

@@ -1,7 +1,7 @@
-"""Signed distances in kernels: a class per form of colliders, each with its numbers and its distance and normal.
+"""Signed distances in kernels: one class per form of colliders, with its parameters, distance and normal.
 
-Points are relative to the pivot of the collider, and turned back. Distances are negative inside of the form, and
-normals are their gradients, which point out of it.
+Points are relative to the pivot of the collider, in its unrotated frame. Distances are negative inside the form.
+Normals are their gradients and point out of the form.
 """
 
 from functools import lru_cache
@@ -13,18 +13,18 @@ from mpmcli.scene.colliders import Plane
 from mpmcli.scene.primitives import Ball, Box, Capsule, Cylinder, Polygon
 from mpmcli.scene.shapes import Form, distance_grid
 
-# Distances below this share of a length have no direction.
+# Vectors shorter than this have no direction.
 TINY = 1e-12
-# Nodes of a grid of distances per cell of the scene, cells that it reaches beyond the form, and the nodes above which
-# it has one per cell.
+# Nodes of a distance grid per cell of the scene, its margin around the form in cells, and the number of nodes above
+# which it has one per cell.
 FINE, MARGIN, MANY = 2, 2, 8_000_000
 
 
 class Distance:
     """The distance from a form.
 
-    `numbers` returns what a kernel needs of a form. `at`, a ti.func, returns the signed distance of y from the form
-    with these numbers, from the first on, and the normal.
+    `numbers` returns the parameters of a form for kernels. `at`, a ti.func, returns the signed distance of y from the
+    form whose parameters begin at index `first`, and the normal.
     """
 
     def __init__(self, dimension: int) -> None:
@@ -33,7 +33,7 @@ class Distance:
 
 @ti.func
 def direction_of(v: ti.template(), size: float, fallback: ti.template()):
-    """Return v / size, a fallback where the size is zero."""
+    """Return v / size, or the fallback if the size is zero."""
     result = fallback
     if size > TINY:
         result = v / size
@@ -42,7 +42,7 @@ def direction_of(v: ti.template(), size: float, fallback: ti.template()):
 
 @ti.func
 def first_axis(y: ti.template()):
-    """Return a unit vector as wide as y."""
+    """Return the unit vector along the first axis, with the dimension of y."""
     result = y * 0.0
     result[0] = 1.0
     return result
@@ -102,7 +102,7 @@ class BoxDistance(Distance):
 
     @ti.func
     def face(self, numbers: ti.template(), first: int, y: ti.template(), axis: int):
-        """Return the signed distance of y from the nearer of the two faces across an axis alone, and the normal."""
+        """Return the signed distance of y from the nearer of the two faces normal to an axis, and the normal."""
         normal = ti.Vector.zero(float, self.dimension)
         out = 0.0
         for a in ti.static(range(self.dimension)):
@@ -131,7 +131,7 @@ class BallDistance(Distance):
 
 @ti.data_oriented
 class CapsuleDistance(Distance):
-    """All points within a radius of a segment: its start, its end less its start, and the radius."""
+    """All points within a radius of a segment: its start, its end minus its start, and the radius."""
 
     def numbers(self, form: Capsule, pivot: np.ndarray) -> list[float]:
         start, end = np.array(form.start), np.array(form.end)
@@ -211,7 +211,7 @@ class PolygonDistance(Distance):
             if own < square:
                 square = own
                 nearest[0], nearest[1] = dx, dy
-                # Right of the edge, which is outside.
+                # The right of the edge is outside.
                 size = ti.sqrt(ex * ex + ey * ey)
                 normal[0], normal[1] = ey / size, -ex / size
             if (ay > y[1]) != (by > y[1]):
@@ -237,7 +237,7 @@ DISTANCES = {
 
 @lru_cache(maxsize=8)
 def samples_of(form: Form, h: float) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return the signed distances from a form for a scene with cells of h metres, see `distance_grid`."""
+    """Return the signed distances from a form in a scene with cells of h metres, see `distance_grid`."""
     lower, upper = form.bounds()
     cells = float(np.prod((upper - lower) / h + 2 * MARGIN))
     fine = FINE if cells * FINE ** len(lower) <= MANY else 1
@@ -246,9 +246,10 @@ def samples_of(form: Form, h: float) -> tuple[np.ndarray, np.ndarray, float]:
 
 @ti.data_oriented
 class GridDistance:
-    """A mesh, union or difference of forms by distances at the nodes of a grid, multilinear between them.
+    """A mesh, union or difference of forms, by distances at the nodes of a grid with multilinear interpolation.
 
-    Its numbers are the first node, the spacing, and the nodes per axis. Beyond the grid the distance to it is added.
+    Its parameters are the first node, the spacing, and the nodes per axis. Outside the grid the distance to the grid is
+    added.
     """
 
     def __init__(self, dimension: int, samples: ti.Field) -> None:
@@ -256,7 +257,7 @@ class GridDistance:
 
     @staticmethod
     def numbers(form: Form, pivot: np.ndarray, h: float) -> list[float]:
-        """Return what a kernel needs beside the samples."""
+        """Return the parameters for kernels, without the samples."""
         values, origin, spacing = samples_of(form, h)
         return [*(origin - pivot), spacing, *map(float, values.shape)]
 

@@ -1,4 +1,4 @@
-"""Fields and numbers in double precision, as every backend has them right."""
+"""Fields and numbers in double precision that are correct on every backend."""
 
 from taichi.lang.expr import Expr
 from taichi.lang.impl import inside_kernel
@@ -10,11 +10,12 @@ QUARTER, REST, TERMS = 1.57079632673412561417, 6.07710050650619224932e-11, 10
 
 
 def double_field(*shape: int, entries: tuple[int, ...] = ()) -> ti.Field:
-    """Return a field of float64 numbers, of vectors of so many `entries`, or of matrices.
+    """Return a field of float64 numbers, or of vectors or matrices with the shape `entries`.
 
-    Taichi 1.7 puts fields of a tree one after another, and on Vulkan it rounds the place of a number of eight bytes
-    down to a multiple of eight: behind an odd number of four bytes it would share half of its bytes with another field.
-    There the field has a tree of its own; elsewhere it has not, as the number of trees is limited.
+    Taichi 1.7 stores the fields of an SNode tree one after another, and on Vulkan it rounds the offset of 8-byte
+    numbers down to a multiple of eight: after an odd number of 4-byte numbers a field would share half of its first
+    number with another field. On Vulkan the field therefore has its own tree. On other backends it does not, because
+    the number of trees is limited.
     """
     on_vulkan = ti.cfg.arch == ti.vulkan
     within = {} if on_vulkan else {"shape": shape}
@@ -35,14 +36,14 @@ def _double(number: object) -> object:
 
 @ti.pyfunc
 def as_double(number: ti.template()):
-    """Return a number in double precision: a literal in a kernel has that of particles."""
+    """Return a number in double precision: a literal in a kernel has the precision of particles."""
     (double,) = ti.static((_double(number),))
     return double
 
 
 @ti.func
 def sin_cos(x: ti.f64):
-    """Return sine and cosine of an angle to round-off, for angles up to 1e6: on Vulkan those of Taichi are single."""
+    """Return sine and cosine of an angle up to 1e6, to round-off: those of Taichi are in f32 on Vulkan."""
     turns = ti.floor(x / as_double(QUARTER) + 0.5)
     r = x - turns * as_double(QUARTER) - turns * as_double(REST)
     s, c = as_double(1.0), as_double(1.0)

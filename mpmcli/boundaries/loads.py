@@ -1,4 +1,4 @@
-"""What colliders take from the material, and bodies from each other, between two frames."""
+"""Impulses of the material on colliders, and of bodies on each other, between two frames."""
 
 import math
 from collections.abc import Sequence
@@ -10,12 +10,14 @@ from mpmcli.quick_taichi import ti
 
 @ti.data_oriented
 class Loads:
-    """Impulses, N s, and angular impulses, N m s, since the last frame, of some takers in each run of a batch.
+    """Impulses, N s, and angular impulses, N m s, on the receivers in each run of a batch since the last frame.
 
     Attributes:
-        capacity: takers of a run; rows: rows of nodes of a run, along the last axis.
-        width: numbers of an impulse and an angular impulse, 3 in 2D, 6 in 3D.
-        taken: of each taker, by rows of nodes: parts of a step share none, so that the sum has an order.
+        capacity: number of receivers of a run.
+        rows: number of rows of nodes of a run, along the last axis.
+        width: number of components of an impulse and an angular impulse, 3 in 2D, 6 in 3D.
+        taken: loads of each receiver by rows of nodes. Parallel parts of a step share no row, so that the order of
+            summation is fixed.
     """
 
     def __init__(self, capacity: int, shape: Sequence[int], runs: int, *, on_cpu: bool) -> None:
@@ -25,17 +27,17 @@ class Loads:
 
     @staticmethod
     def bytes_needed(capacity: int, dimension: int, rows: int) -> int:
-        """Return the bytes that they take on a CPU."""
+        """Return the bytes of the loads of a run on the CPU."""
         return 8 * capacity * rows * (3 if dimension == 2 else 6)
 
     @ti.kernel
     def clear(self, run: int):
-        """Forget what a run has taken."""
+        """Set the loads of a run to zero."""
         for q in range(self.rows * self.capacity):
             self.taken[run * self.rows * self.capacity + q] = ti.Vector.zero(float, self.width)
 
     def read(self, run: int, count: int) -> np.ndarray:
-        """Return what the first takers of a run have taken, (count, width), and forget it."""
+        """Return the loads of the first `count` receivers of a run, (count, width), and set all to zero."""
         size = self.rows * self.capacity
         taken = self.taken.to_numpy()[run * size : (run + 1) * size].astype(np.float64)
         self.clear(run)
@@ -43,7 +45,7 @@ class Loads:
 
     @ti.func
     def sum_up(self, run: int, frame: int, column: int, frame_stats: ti.template()):
-        """Store what the takers of a run have taken in frame_stats[run, frame], from a column on, and forget it."""
+        """Store the loads of a run in frame_stats[run, frame], from `column` on, and set them to zero."""
         for k in range(self.capacity):
             total = ti.Vector.zero(ti.f64, self.width)
             for row in range(self.rows):
@@ -56,7 +58,7 @@ class Loads:
 
     @ti.func
     def row_of(self, node: ti.template()):
-        """Return the row of a node."""
+        """Return the index of the row of a node."""
         row = 0
         for a in ti.static(range(self.dimension - 1)):
             row = row * ti.static(self.shape[a]) + node[a]
@@ -64,7 +66,7 @@ class Loads:
 
     @ti.func
     def take(self, run: int, node: ti.template(), k: int, impulse: ti.template(), arm: ti.template()):
-        """Book the impulse that taker k gets at a node, N s, at an arm from its point of reference, m."""
+        """Add an impulse at a node, N s, to the loads of receiver k, with the arm from its point of reference, m."""
         place = (run * self.rows + self.row_of(node)) * self.capacity + k
         load = self.of(impulse, arm)
         for a in ti.static(range(self.width)):
@@ -75,7 +77,7 @@ class Loads:
 
     @ti.func
     def of(self, impulse: ti.template(), arm: ti.template()):
-        """Return an impulse, N s, at an arm, m, with its angular impulse, N m s."""
+        """Return an impulse, N s, followed by its angular impulse, N m s, for an arm, m."""
         d = ti.static(self.dimension)
         load = ti.Vector.zero(float, ti.static(self.width))
         for a in ti.static(range(d)):

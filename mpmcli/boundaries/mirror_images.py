@@ -1,8 +1,8 @@
-"""Folds what particles scatter beyond the walls onto mirror images, and gives those the mirrored velocity back.
+"""Mirror images of nodes at walls: folds mass and momentum beyond the walls back, and mirrors velocities to the images.
 
-What lies beyond a wall belongs to the mirror images of the nodes inside. It is added to them, mirrored, before momentum
-becomes velocity; afterwards the nodes beyond receive the mirrored velocity. The wall is then second-order accurate,
-where setting node velocities to zero makes it first-order (docs/theory.md, 3.1).
+Nodes beyond a wall are mirror images of the nodes inside. Their mass and momentum are mirrored and added to the nodes
+inside before momentum is divided by mass; afterwards the nodes beyond receive the mirrored velocity. The wall is then
+second-order accurate; setting nodal velocities to zero is first-order accurate (docs/theory.md, 3.1).
 """
 
 from collections.abc import Sequence
@@ -16,18 +16,18 @@ from mpmcli.quick_taichi import ti
 class MirrorImages:
     """The mirror images of nodes behind walls.
 
-    A node has an image for every set of axes along which a wall acts on it and it lies inside that wall. Sets are bits:
-    bit i stands for a mirror across the wall of the i-th of the axes of `walls`; 0 is the node itself.
+    A node has an image for every set of axes along which a wall acts on it and it lies inside that wall. Sets are bit
+    masks: bit i is the reflection at the wall of the i-th of the axes of `walls`; 0 is the node itself.
 
     Attributes:
         walls: the mirrors.
-        needs_contact: whether `find_contact` has to run before nodes are updated; needs_friction: whether
-            `find_friction` has to, after it.
-        shares: of friction's impulse on a column, that of the node on the wall, and that of the two beside it together:
-            the spline's weights at the wall, as a shear stress up to the wall is then in balance.
-        planes: axes of the faces that either of them runs over.
+        needs_contact: whether `find_contact` must run before nodes are updated.
+        needs_friction: whether `find_friction` must run after `find_contact`.
+        shares: fractions of the friction impulse on a column for the node on the wall, and for the two beside it
+            together. They are the spline weights at the wall, which balance a shear stress up to the wall.
+        planes: axes of the faces that `find_contact` and `find_friction` process.
         crossed: per axis, whether walls along other axes always act on its faces.
-        apart: whether nodes near walls of one axis alone are of kinds of their own.
+        apart: whether nodes near walls of a single axis have separate kinds.
     """
 
     def __init__(self, walls: Walls, on_node: float, *, on_cpu: bool) -> None:
@@ -36,7 +36,7 @@ class MirrorImages:
         self.needs_contact = len(walls.separating) > 0
         self.needs_friction = len(walls.rough) > 0
         self.shares = (on_node, 1 - on_node)
-        # In 2D nothing is gained, and software Vulkan compiles for 6 s longer.
+        # There is no gain in 2D, and software Vulkan compiles for 6 s longer.
         self.apart = on_cpu and walls.dimension == 3
         self.planes = tuple(a for a, _ in walls.separating) + tuple(a for _, _, a, _ in walls.rough)
         self.crossed = tuple(
@@ -44,15 +44,15 @@ class MirrorImages:
         )
 
     def along(self, axes: Sequence[int]) -> "MirrorImages":
-        """Return what folds and unfolds the same for nodes that are near no walls of other axes."""
+        """Return the images for nodes that are near walls of `axes` only."""
         images = copy(self)
         images.walls = self.walls.along(axes)
         return images
 
     def in_layer(self, layer: object) -> "MirrorImages":
-        """Return the images of a layer of nodes, each of which presses on walls and rubs on its own.
+        """Return the images of a layer of nodes; each layer has its own contact and friction with walls.
 
-        Layer 0 is that of bodies that share one, unless none does.
+        Layer 0 is that of the bodies that share a layer, if there are any.
         """
         images = copy(self)
         images.walls = copy(self.walls)
@@ -64,12 +64,12 @@ class MirrorImages:
 
     @property
     def kinds(self) -> tuple["MirrorImages", ...]:
-        """The kinds of nodes, see `kind`: for each axis those near its walls alone, which are most, and all others."""
+        """The kinds of nodes, see `kind`: per axis those near its walls only, which are most, and all others."""
         return (*(self.along((a,)) for a in range(self.dimension) if self.apart), self)
 
     @ti.func
     def kind(self, node: ti.template()):
-        """Return the number of the kind of a node that may have images or be one; -1 of others."""
+        """Return the index of the kind of a node that may have images or be one, -1 for other nodes."""
         result = -1
         if ti.static(self.apart):
             for a in ti.static(range(self.dimension)):
@@ -89,16 +89,17 @@ class MirrorImages:
         gravity_step: ti.template(),
         rubbed: ti.template(),
     ):
-        """Return the momentum and mass of a node near a wall together with its images, gravity's pull included.
+        """Return the momentum and mass of a node near a wall together with its images, after a step of gravity.
 
-        A node on a wall that acts is its own image, and what the wall stops cancels. At an image, whose share the node
-        inside takes, the result is zero.
+        A node on an acting wall is its own image, so that the components that the wall stops cancel. The result is zero
+        at an image, whose share is added to the node inside.
 
         Args:
-            first: of `Grid.parts`: of which numbers.
-            place: depth, mirror and upper as `Walls.place` returns them, the walls that act, and those that hold, see
-                `Walls.holding` with the same `rubbed`, whether friction acts.
+            first: index in a node of the first component, an entry of `Grid.parts`.
+            place: depth, mirror and upper of `Walls.place`, the acting walls of `Walls.acting`, and the sticking walls
+                of `Walls.holding` with the same `rubbed`.
             gravity_step: change of velocity by gravity in this step, m/s.
+            rubbed: whether friction acts.
         """
         depth, mirror, upper, acts, holds = ti.static(place)
         owned = True
@@ -127,7 +128,7 @@ class MirrorImages:
     def unfold(
         self, grid: ti.template(), first: ti.template(), node: ti.template(), place: ti.template(), value: ti.template()
     ):
-        """Write a velocity to a node near a wall, and mirrored to its images; `place` as of `fold`."""
+        """Write a velocity to a node near a wall, and mirrored to its images; `place` is that of `fold`."""
         depth, mirror, upper, acts, holds = ti.static(place)
         every = self.every_image(acts, depth)
         for images in range(self.image_sets(every)):
@@ -150,8 +151,8 @@ class MirrorImages:
     ):
         """Return the sum over a node and its images, each mirrored, after a step of gravity.
 
-        Gravity acts before the fold and is mirrored with the momentum: after it, the weight of the material on a floor
-        would exceed what its stress balances.
+        Gravity acts before the fold and is mirrored with the momentum. If it acted after the fold, the weight of the
+        material on a floor would exceed the force of its stress.
         """
         total = ti.Vector.zero(float, grid.kept)
         every = self.every_image(acts, depth)
@@ -172,7 +173,7 @@ class MirrorImages:
 
     @ti.func
     def image_sets(self, every: int):
-        """Return a number above that of any subset: one that is known for a single axis, where no loop is left."""
+        """Return an upper bound of the subsets: a constant for a single axis, so that no loop remains."""
         sets = every + 1
         if ti.static(len(self.walls.axes) == 1):
             sets = 2
@@ -180,7 +181,7 @@ class MirrorImages:
 
     @ti.func
     def image(self, grid: ti.template(), node: ti.template(), mirror: ti.template(), images: int):
-        """Return the linear index of that image."""
+        """Return the linear index of an image."""
         place = node
         for i, a in ti.static(enumerate(self.walls.axes)):
             if images >> i & 1 == 1:
@@ -191,14 +192,14 @@ class MirrorImages:
     def mirrored_value(
         self, value: ti.template(), images: int, holds: ti.template(), upper: ti.template(), mass: float
     ):
-        """Return momentum or velocity (mass 1) mirrored: the normal part always, the rest where the wall holds.
+        """Return mirrored momentum or velocity (mass 1): the normal part always, the rest if the wall sticks.
 
-        That is a reflection about the velocity of the wall. In an edge two of them turn the sign back, and what walls
-        of equal velocity add cancels; where they differ the velocity has a jump there, whatever an image has.
+        This is a reflection about the velocity of the wall. At an edge two reflections restore the sign, and the terms
+        of walls of equal velocity cancel; if they differ, the velocity is discontinuous there with any image.
         """
         result = value
         for i, a in ti.static(enumerate(self.walls.axes)):
-            # An image by translation has the same value.
+            # An image by translation, at a periodic face, has the same value.
             if ti.static(a not in self.walls.periodic):
                 if images >> i & 1 == 1:
                     for c in ti.static(range(self.dimension)):
@@ -214,7 +215,7 @@ class MirrorImages:
 
     @ti.func
     def shift(self, images: int, holds: ti.template(), upper: ti.template()):
-        """Return what the velocity of walls adds to a mirrored velocity: twice that of the last one that turned it."""
+        """Return the term of wall velocities in a mirrored velocity: twice that of the last wall that reverses it."""
         result = ti.Vector.zero(float, self.dimension)
         turned = ti.Vector.zero(int, self.dimension)
         for i, a in ti.static(enumerate(self.walls.axes)):
@@ -222,7 +223,7 @@ class MirrorImages:
                 if images >> i & 1 == 1:
                     along = self.walls.velocity(a, upper[a])
                     for c in ti.static(range(self.dimension)):
-                        # Through itself a wall does not move.
+                        # The normal velocity of a wall is zero.
                         turns = 1
                         if ti.static(c != a):
                             turns = holds[a]
@@ -233,7 +234,7 @@ class MirrorImages:
 
     @ti.func
     def plane_nodes(self, grid: ti.template()):
-        """Return the number of nodes in use of the largest plane that a separating or a rough face lies in."""
+        """Return the largest number of nodes in use of a plane of a separating or a rough face."""
         most = 0
         for f in ti.static(range(len(self.planes))):
             count = 1
@@ -262,9 +263,9 @@ class MirrorImages:
 
     @ti.func
     def find_contact(self, grid: ti.template(), q: int, gravity_step: ti.template()):
-        """For the q-th node in use of the plane of every separating face, note whether it is pressed.
+        """Store whether the material presses on the q-th node in use of the plane of every separating face.
 
-        A wall that lets go only pushes: it acts where the momentum of its node, with this step's forces, points into
+        A separating wall only pushes: it acts where the momentum of its node, with the forces of this step, points into
         it.
         """
         for f in ti.static(range(len(self.walls.separating))):
@@ -274,7 +275,7 @@ class MirrorImages:
             if inside:
                 value = pulled(grid.part(grid.linear_index(node), 0), self.dimension, gravity_step)
                 if ti.static(self.crossed[axis]):
-                    # What other walls fold onto this node is pressed or pulled with it.
+                    # Contributions that other walls fold onto this node are pressed or pulled with it.
                     depth, mirror, upper_side = self.walls.place(node)
                     acts = ti.Vector.zero(int, self.dimension)
                     for b in ti.static(self.walls.lateral[axis]):
@@ -300,12 +301,12 @@ def pulled(value: ti.template(), dimension: ti.template(), gravity_step: ti.temp
 
 @ti.func
 def find_friction(images: ti.template(), grid: ti.template(), q: int, gravity_step: ti.template()):
-    """For the q-th node in use of the plane of every rough face, find what Coulomb friction does to its column.
+    """Compute the Coulomb friction on the column of the q-th node in use of the plane of every rough face.
 
-    A column is what lies along the normal of a node on the wall. The wall takes as much tangential momentum from it as
-    sticking would, and at most the coefficient times the normal momentum that it gives (docs/theory.md, 3.4).
-    `find_contact` comes before. Other walls fold here as if nothing stuck by friction. Faces are numbers of the kernel:
-    a copy of what follows for each of six faces would triple the compile time of a 3D scene.
+    A column consists of the nodes along the normal of a node on the wall. The wall takes as much tangential momentum
+    from it as sticking would, but at most the coefficient times the normal momentum that it gives (docs/theory.md,
+    3.4). `find_contact` must run before. Other walls fold here as if nothing sticks by friction. The loop over the
+    faces is not unrolled: a copy of its body for each of six faces would triple the compile time of a 3D scene.
     """
     d = ti.static(images.dimension)
     for r in range(ti.static(len(images.walls.rough))):
@@ -313,7 +314,7 @@ def find_friction(images: ti.template(), grid: ti.template(), q: int, gravity_st
         for row, of_scene, its_axis, its_side in ti.static(images.walls.rough):
             if r == row:
                 axis, side, number = its_axis, its_side, of_scene
-        # What the wall moves by along itself.
+        # Tangential velocity of the wall.
         along = ti.Vector.zero(float, d)
         if ti.static(images.walls.moves):
             for row, _of_scene, its_axis, its_side in ti.static(images.walls.rough):
@@ -337,7 +338,7 @@ def find_friction(images: ti.template(), grid: ti.template(), q: int, gravity_st
                     place = place * ti.static(images.walls.shape[b]) + node[b]
                     rest = line
             impulse = ti.Vector.zero(float, d)
-            # What an image has fills the node of a periodic face too.
+            # The mass of an image counts for the node of a periodic face, too.
             filled = grid.nodes[grid.linear_index(node)][d] > 0
             if ti.static(len(images.walls.periodic) > 0):
                 filled = True
@@ -367,8 +368,8 @@ def column_friction(
 
         p_w + 2 (m' p + m p') / (m + m')
 
-    from a column, along each axis whose sign they turn: along all of them where the wall sticks. The normal part is
-    what the wall pushes with.
+    from a column, along each axis whose sign they reverse: along all axes if the wall sticks. The normal part is the
+    impulse by which the wall pushes.
     """
     d = ti.static(images.dimension)
     depth, mirror, upper = images.walls.place(node)
@@ -390,7 +391,7 @@ def column_friction(
                 if a == axis:
                     inner[a] += j
                     outer[a] -= j
-            # Which of them lies inside does not matter.
+            # It does not matter which of them lies inside.
             here = pulled(grid.part(grid.linear_index(inner), 0), d, gravity_step)
             there = pulled(grid.part(grid.linear_index(outer), 0), d, gravity_step)
             if others > 0:

@@ -1,9 +1,9 @@
-"""Colliders that move freely: their velocities are found together with those of the nodes in reach.
+"""Free rigid bodies: their velocities are solved together with those of the nodes in reach.
 
-Each body has one velocity U with which its momentum and what the nodes give it agree: M U = P + sum A^T J(U), where J
-are the impulses of `Colliders.met` and A maps U to the velocity at a node. Newton's method finds it in rounds, of which
-each adds up the nodes row by row and then the rows in their order. Whatever it finds, the body gets exactly what the
-nodes lose in the update; on a GPU to single precision, as many nodes add to a row at once.
+The velocity U of a body satisfies M U = P + sum A^T J(U), where J are the impulses of `Colliders.met` and A maps U to
+the velocity at a node. Newton's method solves this in rounds; each round sums over the nodes row by row, and then over
+the rows in order. Converged or not, the body receives exactly the impulse that the nodes lose in the update; on a GPU
+to single precision, because many nodes add to a row at once.
 """
 
 import numpy as np
@@ -13,17 +13,20 @@ from mpmcli.boundaries.doubles import double_field
 from mpmcli.boundaries.rigid_motion import RigidMotion
 from mpmcli.quick_taichi import ti
 
-# Most rounds of a step. A body is settled when a round would change less than this share of its energy with the nodes.
+# Largest number of rounds of a step. A body is settled if a round changes less than this fraction of its energy with
+# the nodes.
 ROUNDS, SETTLED = 6, 1e-12
 
 
 @ti.data_oriented
 class RigidBodies(RigidMotion):
-    """Rigid bodies among the nodes of the grid.
+    """Rigid bodies coupled to the nodes of the grid.
 
     Attributes:
-        sums: impulses of nodes on each, and the matrix that says how they fall with its velocity, by rows of nodes;
-            total: of all rows; entries: numbers of each.
+        sums: by rows of nodes, the impulses of the nodes on each body, and the matrix of their decrease with its
+            velocity.
+        total: sum of `sums` over all rows.
+        entries: number of entries of each sum.
     """
 
     def __init__(self, colliders: Colliders, pushes: object, runs: int) -> None:
@@ -35,7 +38,7 @@ class RigidBodies(RigidMotion):
 
     @ti.func
     def sum_up(self, run: int, frame: int, column: int, frame_stats: ti.template()):
-        """Store poses and rates of a frame, from a column on; add what bodies took to the loads before it."""
+        """Store poses and rates of a frame, from `column` on; add the loads of the bodies to the columns before it."""
         loads, room = ti.static((self.loads, self.colliders.capacity))
         for j in range(self.count):
             b = run * self.count + j
@@ -49,9 +52,9 @@ class RigidBodies(RigidMotion):
                 self.booked[b, a] = ti.cast(0, ti.f64)
 
     def read(self, run: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return poses and rates of the bodies of a run, (count, k), and what they took since the last frame.
+        """Return poses and rates of the bodies of a run, (count, k), and their loads since the last frame.
 
-        That is forgotten. On the CPU the kernel does so, see `sum_up`.
+        The loads are set to zero. On the CPU the kernel does this, see `sum_up`.
         """
         own = slice(run * self.count, (run + 1) * self.count)
         momentum, mobility, booked = (one.to_numpy() for one in (self.momentum, self.mobility, self.booked))
@@ -61,11 +64,11 @@ class RigidBodies(RigidMotion):
         self.booked.from_numpy(booked)
         return np.hstack([self.pose.to_numpy()[own], rates]), taken
 
-    # A round.
+    # Rounds.
 
     @ti.func
     def near(self, node: ti.template(), axes: ti.template()):
-        """Return 1 where a body that is not settled may act on a node, as far as the first axes tell, else 0."""
+        """Return 1 if a body that is not settled may act on a node, judged by the first `axes` axes, else 0."""
         x, near = self.colliders.place_of(node), 0
         for j in range(self.count):
             i = self.collider_of(self.run, j)
@@ -79,7 +82,7 @@ class RigidBodies(RigidMotion):
 
     @ti.func
     def meet(self, node: ti.template(), velocity: ti.template(), mass: float):
-        """Add what a node with this velocity, m/s, and mass, kg, would give to each body."""
+        """Add to the sums what a node with this velocity, m/s, and mass, kg, would give to each body."""
         d = ti.static(self.dimension)
         x, v = self.colliders.place_of(node), ti.Vector.zero(float, d)
         for a in ti.static(range(d)):
@@ -111,19 +114,19 @@ class RigidBodies(RigidMotion):
 
     @ti.func
     def resist(self, row: int, lever: ti.template(), mass: float):
-        """Add the matrix of a node in a direction whose load is `lever` for an impulse of 1 N s."""
+        """Add the matrix of a node in one direction; `lever` is the load of an impulse of 1 N s in this direction."""
         for a in ti.static(range(self.loads)):
             for c in ti.static(range(a, self.loads)):
                 at = ti.static(self.entry(a, c))
                 self.sums[row, at] = self.sums[row, at] + ti.cast(mass, ti.f64) * lever[a] * lever[c]
 
     def entry(self, low: int, high: int) -> int:
-        """Return where a sum has an entry of the matrix, which is symmetric: its upper half behind the load."""
+        """Return the index in a sum of an entry of the symmetric matrix, whose upper triangle follows the load."""
         return self.loads + low * self.loads - low * (low - 1) // 2 + high - low
 
     @ti.func
     def solve(self, run: int, dt: ti.f64):
-        """End a round: change the velocity of each body by what the sums ask for."""
+        """End a round: update the velocity of each body from the sums."""
         n = ti.static(self.loads)
         for j in range(self.count):
             b = run * self.count + j
@@ -143,7 +146,7 @@ class RigidBodies(RigidMotion):
                     for c in range(n):
                         lacked -= self.system[b, a, c] * self.rate[b, c]
                     self.system[b, a, n] = lacked
-                # The upper half of the matrix lies row by row behind the load.
+                # The upper triangle of the matrix follows the load row by row.
                 e = n
                 for a in range(n):
                     for c in range(a, n):
@@ -155,7 +158,7 @@ class RigidBodies(RigidMotion):
 
     @ti.func
     def improve(self, b: int, dt: ti.f64):
-        """Solve the system of body b for what its rate lacks, and add it; a motor adds what it can."""
+        """Solve the system of body b for the correction of its rate, and add it; include the impulse of a motor."""
         n, ways = ti.static(self.loads), self.left[b]
         self.reduce(b)
         for k in range(ways):
@@ -163,7 +166,7 @@ class RigidBodies(RigidMotion):
             for a in range(n):
                 right += self.ways[b, a, k] * self.system[b, a, n]
             self.reduced[b, k, ways] = right
-        # A motor's body has one way, and its system is a number.
+        # A body with a motor has one degree of freedom, and its system is a scalar.
         resisted, lacked = self.reduced[b, 0, 0], self.reduced[b, 0, ways]
         if self.strength[b] > 0:
             wanted = resisted * (self.motor[b] - self.rate_of(b)) - lacked
@@ -185,7 +188,7 @@ class RigidBodies(RigidMotion):
 
     @ti.func
     def take(self, run: int, dt: ti.f64):
-        """Give the bodies what the nodes lost."""
+        """Add the impulses that the nodes lost to the momenta of the bodies."""
         for j in range(self.count):
             b = run * self.count + j
             i = self.collider_of(run, j)
@@ -208,11 +211,11 @@ class RigidBodies(RigidMotion):
 
     @ti.func
     def rows_near(self, i: int):
-        """Return the first row that collider i may act on, and how many there are, per axis but the last."""
+        """Return the first row that collider i may act on, and the number of rows, per axis except the last."""
         d = ti.static(self.dimension)
         low, count = ti.Vector.zero(int, d - 1), ti.Vector.zero(int, d - 1)
         for a in ti.static(range(d - 1)):
-            # One more on each side, whatever is rounded.
+            # One more on each side for rounding.
             begin = (self.colliders.place[i][a] + self.colliders.reach[i][0, a]) / self.colliders.spacing
             end = (self.colliders.place[i][a] + self.colliders.reach[i][1, a]) / self.colliders.spacing
             nodes = ti.static(self.colliders.shape[a])
@@ -229,7 +232,7 @@ class RigidBodies(RigidMotion):
 
     @ti.func
     def row_at(self, low: ti.template(), count: ti.template(), q: int):
-        """Return the q-th of these rows."""
+        """Return the index of the q-th of these rows."""
         row = low[0] + q
         if ti.static(self.dimension == 3):
             row = (low[0] + q // count[1]) * ti.static(self.colliders.shape[1]) + low[1] + q % count[1]

@@ -1,9 +1,9 @@
-"""Contact of rigid bodies with walls, colliders and each other: points of their surfaces, against signed distances.
+"""Contact of rigid bodies with walls, colliders and each other: points of their surfaces against signed distances.
 
-Of each point the nearest thing counts; those of a ball lie where it faces that. Impulses at points are found one after
-another in some sweeps (projected Gauss-Seidel), none of which pulls, and with Coulomb's friction. A point that would
-pass a surface in the step ends on it, or parts from it by its coefficient of restitution; where one has passed already,
-a part of that is undone.
+Each point touches only the nearest obstacle. The point of a ball is that which faces the obstacle. Impulses at the
+points are found by sweeps of projected Gauss-Seidel; they do not pull, and obey Coulomb friction. A point that would
+penetrate a surface in the step ends on it, or separates from it according to the coefficient of restitution. A fraction
+of an existing penetration is removed in each step.
 """
 
 from mpmcli.boundaries.colliders import HOLD, STICK, contact_points
@@ -13,21 +13,21 @@ from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
 from mpmcli.scene.primitives import Ball
 
-# Cells within which a point may meet something in a step; the part of a depth that a step undoes; most sweeps, and the
-# change of impulses in one, over the largest of them, below which they are enough.
+# Distance in cells below which a point may touch an obstacle in a step; fraction of a penetration that a step removes;
+# largest number of sweeps; largest change of an impulse in a sweep, over the largest impulse, at which sweeps end.
 NEAR, UNDONE, SWEEPS, ENOUGH = 0.6, 0.2, 50, 1e-6
-# How often the point of a ball is looked for that faces something.
+# Number of iterations for the point of a ball that faces an obstacle.
 LOOKS = 2
-# Coefficient of friction of what sticks; in place of the number of a collider: a wall, and nothing.
+# Coefficient of friction of sticking surfaces; codes of a wall and of no obstacle in place of the index of a collider.
 STUCK = 1e3
 WALL, NOTHING = -1, -2
-# Where a point may pass a surface in this step, and parts from it in the next.
+# Rebound of a point that may pass a surface in this step and separates from it in the next.
 LATER = -1.0
 
 
 @ti.data_oriented
 class RigidContact:
-    """The contact of the bodies of some runs; `faces` are the words of the walls, `capacity` the points of a run."""
+    """Contact of the bodies of some runs; `faces` are the conditions of the walls, `capacity` the points of a run."""
 
     def __init__(self, bodies: RigidBodies, faces: tuple[tuple[str, str], ...], runs: int) -> None:
         d, self.bodies, self.dimension = bodies.dimension, bodies, bodies.dimension
@@ -37,17 +37,18 @@ class RigidContact:
         self.used = ti.field(int, shape=runs)
         # Of each body the radius if it is a ball, m, else 0.
         self.ball = double_field(runs * bodies.count)
-        # Of each point: its body, and where it is on it.
+        # Of each point: its body, and its position relative to the body.
         self.body, self.point = ti.field(int, shape=n), double_field(n, entries=(d,))
-        # How far it is from the centre of its body in this step.
+        # Its arm from the centre of its body in this step.
         self.arm = double_field(n, entries=(d,))
-        # What it may meet in this step, the number of a collider or WALL, at a distance and with a normal.
+        # Whether it may touch an obstacle in this step, and which: the index of a collider, or WALL; its distance,
+        # friction and normal, and the impulse.
         self.meets, self.other = ti.field(int, shape=n), ti.field(int, shape=n)
         self.gap, self.friction = double_field(n), double_field(n)
         self.normal, self.impulse = (double_field(n, entries=(d,)) for _ in range(2))
-        # By which it parts from what it begins to touch, m/s, or LATER.
+        # Speed at which it separates from an obstacle that it begins to touch, m/s, or LATER.
         self.rebound = double_field(n)
-        # Of each collider the body that it is, or -1, and its coefficient of restitution; of each face its friction.
+        # Of each collider the index of its body, or -1, and its coefficient of restitution; of each face its friction.
         self.body_of = ti.field(int, shape=bodies.colliders.capacity)
         self.body_of.fill(-1)
         for j, k in enumerate(bodies.free):
@@ -75,7 +76,7 @@ class RigidContact:
 
     @ti.func
     def resolve(self, run: int, dt: ti.f64, extent: ti.template(), colliders: ti.template()):
-        """Change the momenta of the bodies so that no point passes a surface in a step of dt seconds."""
+        """Change the momenta of the bodies so that no point penetrates a surface in a step of dt seconds."""
         first = run * self.capacity
         any_meets = False
         for q in range(first, first + self.used[run]):
@@ -97,9 +98,9 @@ class RigidContact:
 
     @ti.func
     def look(self, run: int, q: int, dt: ti.f64, extent: ti.template(), colliders: ti.template()):
-        """Find what point q may meet; return whether there is anything.
+        """Find the obstacle that point q may touch; return whether there is one.
 
-        Where that is what it met in the step before, the impulses of that step are where those of this one begin.
+        If it is that of the previous step, the impulse of that step is the initial value in this step.
         """
         d = ti.static(self.dimension)
         b = run * self.bodies.count + self.body[q]
@@ -111,7 +112,7 @@ class RigidContact:
             tries += LOOKS
         for k in range(tries):
             if k > 0 and other != NOTHING:
-                # Of a ball the point that faces what is near.
+                # The point of a ball that faces the obstacle.
                 for a in ti.static(range(d)):
                     arm[a] = -self.ball[b] * normal[a]
             gap, other, friction, found = self.nearest(run, b, own, arm, extent, colliders)
@@ -135,8 +136,8 @@ class RigidContact:
                 bounces = ti.max(bounces, self.restitution[run * colliders.capacity + other])
             approach = -self.velocity_of(run, q, colliders).dot(normal)
             if bounces > 0 and approach > 0:
-                # It parts from where it is at the end of this step or the next, whichever is nearer to the surface.
-                # Half of what gravity does in the step comes before it, half after.
+                # It separates at the end of this step or of the next, whichever is closer to the surface. Half of the
+                # velocity change by gravity and forces in the step comes before that, half after.
                 pulled = -0.5 * normal.dot(self.bodies.kick[b])
                 if other >= 0:
                     if self.body_of[other] >= 0:
@@ -147,7 +148,7 @@ class RigidContact:
 
     @ti.func
     def nearest(self, run: int, b: int, own: int, arm: ti.template(), extent: ti.template(), colliders: ti.template()):
-        """Return what is nearest to a point at an arm from the centre of body b: distance, which, friction, normal."""
+        """Return distance, code, friction and normal of what is nearest to a point at an arm from body b's centre."""
         d = ti.static(self.dimension)
         x, normal = arm, ti.Vector.zero(ti.f64, d)
         for a in ti.static(range(d)):
@@ -174,7 +175,7 @@ class RigidContact:
 
     @ti.func
     def rubbed(self, q: int, rub: ti.template(), pressed: ti.f64):
-        """Return an impulse along a surface, no larger than friction allows at point q."""
+        """Return an impulse along a surface, limited by the friction at point q."""
         most, size, result = self.friction[q] * pressed, rub.norm(), rub
         if size > most:
             result *= most / size
@@ -187,7 +188,7 @@ class RigidContact:
 
     @ti.func
     def push(self, run: int, q: int, dt: ti.f64, colliders: ti.template()):
-        """Change the impulse at point q so that it holds there; return by how much, N s."""
+        """Update the impulse at point q to satisfy its contact conditions; return the size of the change, N s."""
         velocity = self.velocity_of(run, q, colliders)
         normal, before = self.normal[q], self.impulse[q]
         along = velocity.dot(normal)
@@ -217,7 +218,7 @@ class RigidContact:
 
     @ti.func
     def velocity_of(self, run: int, q: int, colliders: ti.template()):
-        """Return the velocity of point q as seen from what it meets, m/s."""
+        """Return the velocity of point q relative to its obstacle, m/s."""
         velocity = ti.Vector.zero(ti.f64, self.dimension)
         for s in range(2):
             b, arm, sign = self.side(run, q, s)
@@ -231,7 +232,7 @@ class RigidContact:
 
     @ti.func
     def give(self, run: int, q: int, impulse: ti.template()):
-        """Give the body of point q an impulse there, N s, and the body that it meets the opposite one."""
+        """Apply an impulse, N s, to the body of point q there, and the opposite one to an obstacle that is a body."""
         for s in range(2):
             b, arm, sign = self.side(run, q, s)
             if b >= 0:
@@ -239,9 +240,9 @@ class RigidContact:
 
     @ti.func
     def side(self, run: int, q: int, s: int):
-        """Return the body of point q, or of what it meets (s = 1), the arm of the point from its centre, and 1 or -1.
+        """Return the body of point q, or its obstacle (s = 1), the arm of the point from its centre, and 1 or -1.
 
-        In place of a body that is none -1, and in place of the arm the place of the point.
+        For an obstacle that is not a body, the body is -1, and the arm is the position of the point.
         """
         b, arm, sign = run * self.bodies.count + self.body[q], self.arm[q], 1.0
         if s == 1:
@@ -257,7 +258,7 @@ class RigidContact:
 
     @ti.func
     def yielding(self, run: int, q: int, n: ti.template()):
-        """Return what an impulse of 1 N s along n adds to the velocity of point q, seen from what it meets, m/s."""
+        """Return the change of the relative velocity of point q along n by an impulse of 1 N s along n, m/s."""
         result = ti.cast(0, ti.f64)
         for s in range(2):
             b, arm, _sign = self.side(run, q, s)

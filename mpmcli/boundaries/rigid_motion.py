@@ -1,8 +1,8 @@
-"""How rigid bodies move: their momenta, what holds them, and the steps of their poses, all in double precision.
+"""Motion of rigid bodies: momenta, constraints, and time integration of the poses, in double precision.
 
-A body has a velocity U, of its centre and its spin. U = W y, with a column of W for each way in which it can move: all
-of them, those that `fixed` leaves, or the one of its joint. What holds it takes the rest of the momentum. A motor gives
-what keeps y, as far as its strength goes.
+The velocity U of a body has the components of its centre and its spin. U = W y, with a column of W per degree of
+freedom: all of them, those that `fixed` leaves, or that of its joint. Constraints take the rest of the momentum. A
+motor gives the impulse that keeps y, limited by its strength.
 """
 
 import math
@@ -15,29 +15,39 @@ from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
 from mpmcli.scene.rigid import Hinge
 
-# Angle of a part of a turn in a step, rad, and most parts.
+# Angle of a substep of the rotation in a step, rad, and largest number of substeps.
 PART, MOST_PARTS = 1e-3, 100.0
 
 
 @ti.data_oriented
 class RigidMotion:
-    """The colliders of some runs that move freely.
+    """The free colliders of some runs.
 
     Attributes:
-        free: their indices among the colliders of a run; run: whose bodies are meant; pushes: a `RigidDrive`.
-        pose: where their centres are, relative to the lower corner, m, and their angles, rad, or unit quaternions.
-        momentum: and angular momentum about the centre. booked: what they took from the material since the last frame.
-        rate: velocity and angular velocity, as the rounds of a step have found them so far; settled: whether they have.
-        support: what walls and the like gave each in the last step; the rounds take it for what they give in this one.
-        inertia: about the axes of the shape; mobility: the rate for a momentum, W (W^T M W)^-1 W^T, as it is now.
-        axes: in 3D the principal axes of the shape, a column each, and behind them the moments about them.
-        ways, left: W, and how many columns it has; spins: whether all rotations are among them.
-        start: where the centre was; kick: what gravity and forces add to its velocity in this step, m/s.
-        hinge: where the point of a hinge is, and from it the centre, about the axes of the shape, m; hinged: whether
-            there is one.
-        strength: of a motor, N m or N, 0 without; motor: the rate that it keeps; drive: its impulse in this step.
-        weight, square: of the first way w: w^T M w and w^T w.
-        system: the matrix of an equation for U and its right side; reduced: the same for y, with room for several.
+        free: their indices among the colliders of a run.
+        run: the current run.
+        pushes: a `RigidDrive`.
+        pose: positions of the centres relative to the lower corner, m, and angles, rad, or unit quaternions.
+        momentum: momentum, and angular momentum about the centre.
+        booked: impulses of the material since the last frame.
+        rate: velocity and angular velocity, as found by the rounds of a step so far.
+        settled: whether the rounds have converged.
+        support: impulses of walls and other contacts in the last step, the estimate of the rounds for this step.
+        inertia: inertia about the axes of the shape.
+        mobility: matrix that maps momentum to rate in the current pose, W (W^T M W)^-1 W^T.
+        axes: in 3D, the principal axes of the shape in columns, followed by the moments about them.
+        ways, left: W, and the number of its columns.
+        spins: whether W includes all rotations.
+        start: initial position of the centre.
+        kick: velocity change by gravity and forces in this step, m/s.
+        hinge: position of a hinge, and the arm from it to the centre about the axes of the shape, m.
+        hinged: whether there is a hinge.
+        strength: strength of a motor, N m or N, 0 without a motor.
+        motor: the rate that the motor keeps.
+        drive: impulse of the motor in this step.
+        weight, square: w^T M w and w^T w of the first column w of W.
+        system: matrix and right side of an equation for U.
+        reduced: the same for y, with room for several right sides.
     """
 
     def __init__(self, colliders: Colliders, pushes: object, runs: int) -> None:
@@ -95,9 +105,9 @@ class RigidMotion:
 
     @ti.func
     def begin(self, run: int, dt: ti.f64, kick: float, pull: ti.template()):
-        """Begin a step of dt seconds: put the bodies in place.
+        """Begin a step of dt seconds: set the positions of the bodies, and apply gravity and forces.
 
-        Gravity changes velocities by pull, m/s, and forces act for kick seconds.
+        Gravity changes velocities by `pull`, m/s, and forces act for `kick` seconds.
         """
         d = ti.static(self.dimension)
         for j in range(self.count):
@@ -136,7 +146,7 @@ class RigidMotion:
                 self.follow(b)
             self.set_mobility(b)
             if self.left[b] < self.loads:
-                # What holds it takes the momentum in other directions.
+                # Constraints take the momentum in other directions.
                 if self.hinged[b] == 0:
                     self.take_rate(b)
                 for a in range(self.loads):
@@ -150,10 +160,11 @@ class RigidMotion:
 
     @ti.func
     def turn(self, b: int, dt: ti.f64):
-        """Turn body b about its centre in dt seconds: its angular momentum stays, or its spin where that is held.
+        """Rotate body b about its centre in dt seconds, at constant angular momentum, or spin if that is constrained.
 
-        A free one in 3D in parts, of each turns about the principal axes one after another (Dullweber, Leimkuhler and
-        McLachlan 1997): the energy swings by the square of an angle PART, and does not drift.
+        In 3D an unconstrained rotation takes substeps, each of rotations about the principal axes in sequence
+        (Dullweber, Leimkuhler and McLachlan 1997): the energy oscillates by the square of the angle PART, and does not
+        drift.
         """
         if ti.static(self.dimension == 2):
             self.pose[b, 2] = self.pose[b, 2] + dt * self.rate[b, 2]
@@ -190,7 +201,7 @@ class RigidMotion:
 
     @ti.func
     def carried(self, q: ti.template(), v: ti.template()):
-        """Return a vector turned by a unit quaternion."""
+        """Return a vector rotated by a unit quaternion."""
         u = ti.Vector([q[1], q[2], q[3]])
         side = 2.0 * u.cross(v)
         return v + q[0] * side + u.cross(side)
@@ -202,11 +213,11 @@ class RigidMotion:
         w = p[0] * u + q[0] * v + v.cross(u)
         return ti.Vector([p[0] * q[0] - v.dot(u), w[0], w[1], w[2]])
 
-    # Of a body that a joint holds.
+    # Bodies with a joint.
 
     @ti.func
     def turn_motor(self, b: int, dt: ti.f64):
-        """Let the motor of body b give in all, in a step of dt seconds, what keeps its rate, or what it can."""
+        """Set the impulse of the motor of body b in a step of dt seconds: it keeps the rate, within its strength."""
         if self.strength[b] > 0:
             given = self.clamped(b, dt, self.drive[b] + (self.motor[b] - self.rate_of(b)) * self.weight[b])
             for a in range(self.loads):
@@ -217,12 +228,12 @@ class RigidMotion:
 
     @ti.func
     def clamped(self, b: int, dt: ti.f64, impulse: ti.f64):
-        """Return what the motor of body b can give of an impulse in dt seconds."""
+        """Return an impulse limited by the strength of the motor of body b in dt seconds."""
         return ti.max(ti.min(impulse, self.strength[b] * dt), -self.strength[b] * dt)
 
     @ti.func
     def rate_of(self, b: int):
-        """Return the rate of body b along its first way, the one of a joint."""
+        """Return the rate of body b along its first degree of freedom, that of a joint."""
         result = ti.cast(0, ti.f64)
         for a in range(self.loads):
             result += self.ways[b, a, 0] * self.rate[b, a]
@@ -230,7 +241,7 @@ class RigidMotion:
 
     @ti.func
     def follow(self, b: int):
-        """Put the centre of body b where the hinge leaves it, and let it move on about that."""
+        """Set the centre of body b from its hinge and rotation, and its velocity to a rotation about the hinge."""
         d = ti.static(self.dimension)
         rate = self.rate_of(b)
         own, spin = ti.Vector.zero(ti.f64, d), ti.Vector.zero(ti.f64, self.turns)
@@ -246,11 +257,11 @@ class RigidMotion:
         for a in range(self.loads):
             self.rate[b, a] = rate * self.ways[b, a, 0]
 
-    # What a momentum, or an impulse, does to a body.
+    # Response of a body to a momentum or an impulse.
 
     @ti.func
     def set_mobility(self, b: int):
-        """Set the mobility of body b as it is now."""
+        """Set the mobility of body b in its current pose."""
         n, ways = ti.static(self.loads), self.left[b]
         self.set_inertia(b)
         self.reduce(b)
@@ -268,7 +279,7 @@ class RigidMotion:
 
     @ti.func
     def set_inertia(self, b: int):
-        """Let the matrix of the system of body b be that of its mass and inertia."""
+        """Set the matrix of the system of body b to that of its mass and inertia."""
         d = ti.static(self.dimension)
         own = self.inertia[b]
         if ti.static(d == 3):
@@ -284,11 +295,11 @@ class RigidMotion:
 
     @ti.func
     def reduce(self, b: int):
-        """Set the matrix W^T S W of body b, S that of its system."""
+        """Set the reduced matrix W^T S W of body b, where S is that of its system."""
         n, ways = ti.static(self.loads), self.left[b]
         for m in range(ways):
             for a in range(n):
-                # S W, behind the matrix.
+                # S W, stored after the matrix.
                 moved = ti.cast(0, ti.f64)
                 for c in range(n):
                     moved += self.system[b, a, c] * self.ways[b, c, m]
@@ -302,7 +313,7 @@ class RigidMotion:
 
     @ti.func
     def eliminate(self, b: int, sides: int):
-        """Solve the reduced system of body b, which is symmetric and positive, for some right sides, in their place."""
+        """Solve the reduced, symmetric positive definite system of body b for `sides` right sides, in place."""
         n = self.left[b]
         for k in range(n):
             first = 1.0 / self.reduced[b, k, k]
@@ -316,7 +327,7 @@ class RigidMotion:
 
     @ti.func
     def show_rate(self, b: int, i: int, dt: ti.f64):
-        """Let nodes meet body b, which is collider i, with its rate: the chords of a step of dt seconds."""
+        """Set the velocity field of collider i from the rate of body b: along the chords of a step of dt seconds."""
         d = ti.static(self.dimension)
         spin, square = ti.Vector.zero(ti.f64, self.turns), ti.cast(0, ti.f64)
         for a in ti.static(range(self.turns)):
@@ -347,11 +358,11 @@ class RigidMotion:
             s, c = sin_cos(x)
         return s, c
 
-    # Of a body.
+    # Quantities of a body.
 
     @ti.func
     def load_of(self, impulse: ti.template(), arm: ti.template()):
-        """Return what `Loads.of` does, in double precision."""
+        """Return the result of `Loads.of` in double precision."""
         load = ti.Vector.zero(ti.f64, self.loads)
         for a in ti.static(range(self.dimension)):
             load[a] = impulse[a]
@@ -376,7 +387,7 @@ class RigidMotion:
 
     @ti.func
     def hit(self, b: int, impulse: ti.template(), arm: ti.template()):
-        """Give body b an impulse at an arm from its centre."""
+        """Apply an impulse to body b at an arm from its centre."""
         load = self.load_of(impulse, arm)
         for a in ti.static(range(self.loads)):
             self.momentum[b, a] = self.momentum[b, a] + load[a]
@@ -385,7 +396,7 @@ class RigidMotion:
 
     @ti.func
     def yields(self, b: int, n: ti.template(), arm: ti.template()):
-        """Return by how much the velocity of body b along n grows with an impulse along it at an arm, 1/kg."""
+        """Return the increase of the velocity of body b along n per impulse along n at an arm, 1/kg."""
         load, result = self.load_of(n, arm), ti.cast(0, ti.f64)
         for a in ti.static(range(self.loads)):
             for c in ti.static(range(self.loads)):
@@ -394,7 +405,7 @@ class RigidMotion:
 
     @ti.func
     def take_rate(self, b: int):
-        """Let body b have the velocity that follows from its momentum."""
+        """Set the rate of body b from its momentum."""
         for a in range(self.loads):
             rate = ti.cast(0, ti.f64)
             for c in range(self.loads):
@@ -403,7 +414,7 @@ class RigidMotion:
 
     @ti.func
     def turned(self, b: int):
-        """Return the rotation of body b, (d, d)."""
+        """Return the rotation matrix of body b, (d, d)."""
         d = ti.static(self.dimension)
         result = ti.Matrix.zero(ti.f64, d, d)
         if ti.static(d == 2):
@@ -420,7 +431,7 @@ class RigidMotion:
 
     @ti.func
     def crossed(self, v: ti.template()):
-        """Return the matrix (d, d) that maps an arm to the velocity there for a spin, of 1 or 3 numbers."""
+        """Return the matrix (d, d) that maps an arm to the velocity there for a spin of 1 or 3 components."""
         d = ti.static(self.dimension)
         result = ti.Matrix.zero(ti.f64, d, d)
         if ti.static(d == 2):

@@ -1,7 +1,7 @@
-"""The faces of the domain: walls that slip, stick or separate, with or without friction, and move along themselves.
+"""The faces of the domain: slip, stick or separating walls, with or without friction, that may move along themselves.
 
-A wall lies on a plane of nodes. `Walls` holds where the walls are, which of them act on a node, and what they do to its
-velocity; what particles scatter beyond them is folded back by `mirror_images` (docs/theory.md, 3).
+A wall lies on a plane of nodes. `Walls` has the positions of the walls, finds those that act on a node, and constrains
+its velocity; `mirror_images` folds back what particles scatter beyond the walls (docs/theory.md, 3).
 """
 
 import math
@@ -15,9 +15,9 @@ from mpmcli.scene.schema import SolverSettings
 
 # Nodes on each side of a wall that can hold mass from particles of the other side.
 REACH = 2
-# Nodes beyond a periodic face that particles write until they are put back into the domain: all that the grid has.
+# Nodes beyond a periodic face to which particles scatter before they are moved back into the domain: all of the grid.
 PERIODIC_REACH = 3
-# The word of a face that is no wall.
+# Condition of a face that is not a wall.
 OPEN = "open"
 
 
@@ -29,11 +29,12 @@ def moving_faces(scene: Scene) -> tuple[tuple[int, int], ...]:
 
 @ti.data_oriented
 class MovingFaces:
-    """Velocities of the faces that move. They are data: runs that differ in them share kernels.
+    """Velocities of the faces that move. They are data, so that runs that differ in them share kernels.
 
     Attributes:
         faces: (axis, side) of every such face.
-        velocity: of each run and face, m/s; first: row of the first face of a run.
+        velocity: velocity of each face of each run, m/s.
+        first: row of the first face of the current run.
     """
 
     def __init__(self, faces: Sequence[tuple[int, int]], dimension: int = 0, runs: int = 1) -> None:
@@ -49,7 +50,7 @@ class MovingFaces:
 
     @ti.func
     def of(self, face: ti.template()):
-        """Return the velocity of a face, by its number in `faces`."""
+        """Return the velocity of a face by its index in `faces`."""
         return self.velocity[self.first + face]
 
 
@@ -64,11 +65,12 @@ def rough_faces(scene: Scene) -> tuple[tuple[int, int], ...]:
 
 @ti.data_oriented
 class RoughFaces:
-    """Coefficients of friction of the faces that have any. They are data: runs that differ in them share kernels.
+    """Coefficients of friction of the rough faces. They are data, so that runs that differ in them share kernels.
 
     Attributes:
         faces: (axis, side) of every such face.
-        coefficient: of each run and face; first: row of the first face of a run.
+        coefficient: coefficient of each face of each run.
+        first: row of the first face of the current run.
     """
 
     def __init__(self, faces: Sequence[tuple[int, int]], runs: int = 1) -> None:
@@ -84,7 +86,7 @@ class RoughFaces:
 
     @ti.func
     def of(self, face: ti.template()):
-        """Return the coefficient of a face, by its number in `faces`."""
+        """Return the coefficient of a face by its index in `faces`."""
         return self.coefficient[self.first + face]
 
 
@@ -92,7 +94,7 @@ SMOOTH = RoughFaces(())
 
 
 def faces_on_grid(faces: Sequence[tuple[str, str]], settings: SolverSettings) -> tuple[tuple[str, str], ...]:
-    """Return the words of the walls that mirror nodes: on the grid of the state at rest those that never let go."""
+    """Return the conditions of the walls that mirror nodes: with total Lagrangian solids, separating walls do not."""
     total = settings.solids == "total"
     return tuple(tuple(OPEN if total and word == "separate" else word for word in pair) for pair in faces)
 
@@ -102,22 +104,26 @@ class Walls:
     """All faces of the domain, as a boundary that acts on nodes.
 
     Attributes:
-        faces: per axis the words of the lower and the upper face: "slip", "stick", "separate", PERIODIC, or OPEN for
-            none. periodic: the axes of periodic ones; reach: nodes on each side of any face that may have images.
-        first: index of the wall's node plane at the lower faces; `last`, per axis, at the upper ones.
-        shape: nodes of the grid per axis; lateral: per axis, the other axes.
-        separating: (axis, side) of every face whose word is "separate".
-        axes: those whose faces are asked for: all, or fewer for nodes that are near no others, see `along`.
+        faces: per axis, the conditions of the lower and the upper face: "slip", "stick", "separate", PERIODIC, or OPEN
+            for none.
+        periodic: the axes of periodic faces.
+        reach: number of nodes on each side of a face that may have images.
+        first: index of the node plane of the lower faces; `last`, per axis, of the upper faces.
+        shape: nodes of the grid per axis.
+        lateral: per axis, the other axes.
+        separating: (axis, side) of every face with the condition "separate".
+        axes: axes whose faces are considered: all, or fewer for nodes that are near no other faces, see `along`.
         contact: (planes, nodes) int, per separating face and node of its plane, whether the material presses on it.
         first_plane: row of `contact` of the first separating face.
-        friction: the coefficients; rough: of every face that has one and is a wall here its place among these,
-            its number there, axis and side.
-        impulse: per rough face of each run and node of its plane, (d,): along the wall the momentum, kg m/s, that
-            friction adds to a column of nodes that slides; along the normal 1 where the column sticks, else 0.
+        friction: the coefficients of friction.
+        rough: of every wall with friction: its index in `rough`, its index in `friction`, axis and side.
+        impulse: per rough face of each run and node of its plane, (d,): along the wall, the momentum, kg m/s, that
+            friction adds to a sliding column of nodes; along the normal, 1 if the column sticks, else 0.
         first_rough: row of `impulse` of the first rough face.
-        moving: velocities of the faces that move; moves: whether any does.
-        shut: depth from which on nothing moves through a wall that has let go, a number or a variable of a kernel:
-            that of the wall, or REACH behind it where bodies meet it by their surfaces (`contact.obstacles`).
+        moving: velocities of the faces that move.
+        moves: whether any face moves.
+        shut: depth at and below which nothing moves through a separating wall that does not act, a number or a variable
+            of a kernel: 0, or -REACH where bodies meet the wall by their surfaces (`contact.obstacles`).
     """
 
     def __init__(
@@ -130,7 +136,7 @@ class Walls:
         friction: RoughFaces = SMOOTH,
         moving: MovingFaces = STILL,
     ) -> None:
-        """Allocate, with one set of planes in `contact` and `impulse` for each of some runs."""
+        """Allocate one set of planes in `contact` and `impulse` for each run."""
         self.dimension, self.axes = len(faces), tuple(range(len(faces)))
         self.faces = tuple(tuple(pair) for pair in faces)
         self.periodic = tuple(a for a, pair in enumerate(self.faces) if PERIODIC in pair)
@@ -156,21 +162,21 @@ class Walls:
             self.impulse = ti.Vector.field(self.dimension, float, shape=(runs * len(planes), max(planes)))
 
     def plane_size(self, axis: int) -> int:
-        """Return the nodes of a plane normal to `axis`."""
+        """Return the number of nodes of a plane normal to `axis`."""
         return math.prod(self.shape[b] for b in self.lateral[axis])
 
     def along(self, axes: Sequence[int]) -> "Walls":
-        """Return what acts the same on nodes that are near no walls of other axes; distances are those from all."""
+        """Return the walls for nodes that are near walls of `axes` only; distances are those from all walls."""
         walls = copy(self)
         walls.axes = tuple(axes)
         return walls
 
     @ti.func
     def constrain(self, node: ti.template(), velocity: ti.template()):
-        """Return the velocity of a node after the walls.
+        """Return the velocity of a node after the walls have acted.
 
-        On a wall that acts there is no normal part, and none at all where it sticks. On and behind a wall that has let
-        go nothing moves through it, see `shut`.
+        On an acting wall the normal component is zero, and the tangential one is that of the wall if it sticks. On and
+        behind a separating wall that does not act, nothing moves through it, see `shut`.
         """
         result = velocity
         if self.distance(node) <= 0:
@@ -189,7 +195,7 @@ class Walls:
         acts: ti.template(),
         holds: ti.template(),
     ):
-        """Return what `constrain` does, of a node whose place, walls that act and that hold are known."""
+        """Return the result of `constrain` for a node with known depth, side, acting walls and sticking walls."""
         result = velocity
         for a in ti.static(self.axes):
             if acts[a] == 1 and depth[a] == 0:
@@ -204,8 +210,8 @@ class Walls:
 
     @ti.func
     def distance(self, node: ti.template()):
-        """Return the nodes from the nearest wall inwards to the node, negative behind a wall."""
-        # Minima and no `or`: branches at every node of the grid would cost more.
+        """Return the number of nodes from the nearest wall inwards to the node, negative behind a wall."""
+        # Minima instead of `or`: branches at every node of the grid would cost more.
         result = self.distance_along(node, 0)
         for a in ti.static(range(1, self.dimension)):
             result = ti.min(result, self.distance_along(node, a))
@@ -213,7 +219,7 @@ class Walls:
 
     @ti.func
     def distance_along(self, node: ti.template(), axis: ti.template()):
-        """Return the nodes from the nearest wall of an axis inwards to the node, negative behind a wall."""
+        """Return the number of nodes from the nearest wall of an axis inwards to the node, negative behind a wall."""
         return ti.min(node[axis] - self.first, self.last[axis] - node[axis])
 
     @ti.func
@@ -223,10 +229,10 @@ class Walls:
 
     @ti.func
     def place(self, node: ti.template()):
-        """Return, per axis, how deep inside a wall within reach the node lies, its mirror, and which wall it is.
+        """Return, per axis, the depth of the node inside a wall within reach, its mirror, and 1 for the upper wall.
 
-        The depth counts nodes inwards, and is REACH + 1 where no wall is within reach. The mirror of a periodic face is
-        the image beyond the other one, and the depth 1 inside, where nothing lies on a wall, and -1 beyond.
+        The depth counts nodes inwards, and is REACH + 1 if no wall is within reach. At a periodic face the mirror is
+        the image beyond the opposite face; the depth is 1 inside and -1 beyond, because no node lies on a wall.
         """
         depth = ti.Vector.zero(int, self.dimension)
         mirror = node
@@ -263,7 +269,7 @@ class Walls:
             acts[a] = ti.cast(depth[a] <= REACH, int)
             if depth[a] < 0:
                 inner[a] = mirror[a]
-        # Contact is looked up at the image inside the domain: a node and all its images agree.
+        # Contact is looked up at the image inside the domain, so that a node and all its images agree.
         for f in ti.static(range(len(self.separating))):
             axis = ti.static(self.separating[f][0])
             if ti.static(axis in self.axes):
@@ -281,8 +287,8 @@ class Walls:
 
     @ti.func
     def face_is(self, word: ti.template(), axis: ti.template(), upper: int):
-        """Return whether the face of `axis` on that side has this word."""
-        # In branches: Taichi takes a static flag as an operand of `and` for false inside some conditions.
+        """Return whether the face of `axis` on that side has this condition."""
+        # Branches, because inside some conditions Taichi takes a static flag as an operand of `and` for false.
         result = False
         if ti.static(self.faces[axis][0] == word):
             result = upper == 0
@@ -293,9 +299,9 @@ class Walls:
 
     @ti.func
     def holding(self, node: ti.template(), depth: ti.template(), upper: ti.template(), rubbed: ti.template()):
-        """Return, per axis, whether the wall within reach lets nothing slip along it: by its word, or by friction.
+        """Return, per axis, whether the wall within reach sticks, by its condition or by friction.
 
-        The node is no image, or lies on the wall; `rubbed` says whether friction was found.
+        The node must not be an image unless it lies on the wall. `rubbed` states whether friction has been computed.
         """
         holds = ti.Vector.zero(int, self.dimension)
         for a in ti.static(self.axes):
@@ -312,7 +318,7 @@ class Walls:
     def stopped(
         self, value: ti.template(), axis: ti.template(), holds: ti.template(), upper: ti.template(), mass: float
     ):
-        """Return momentum, or velocity with mass 1, on a wall that acts: no normal part, its own where it holds."""
+        """Return momentum, or velocity with mass 1, on an acting wall: no normal part, the wall's own if it sticks."""
         result = value
         for c in ti.static(range(self.dimension)):
             if ti.static(c == axis):
@@ -326,7 +332,7 @@ class Walls:
 
     @ti.func
     def closed(self, value: ti.template(), acts: ti.template(), depth: ti.template()):
-        """Return it without what a moving wall drives through another one, which it meets in an edge."""
+        """Return the value without the part that a moving wall drives through another wall at a common edge."""
         result = value
         for a in ti.static(self.axes):
             if acts[a] == 1 and depth[a] == 0:

@@ -1,1 +1,1 @@
-"""Says whether everything that mpmcli needs works on this machine, and what to do where it does not."""
+"""Checks whether the components that mpmcli needs work on this machine, and suggests remedies."""

@@ -1,4 +1,4 @@
-"""Tries each component that mpmcli needs, in a process of its own."""
+"""Checks each component that mpmcli needs, in a separate process."""
 
 import ctypes
 import importlib.metadata
@@ -19,13 +19,13 @@ from mpmcli import __version__
 from mpmcli.plain_text import counted, size_text
 from mpmcli.processes.pool import Fault, in_processes
 
-# As in pyproject.toml.
+# Supported versions of Python, as in pyproject.toml.
 OLDEST, NEWEST = (3, 11), (3, 13)
-# Processes at once; they mostly load libraries. Their time limit, s, and that of ffmpeg.
+# Number of concurrent processes, which mostly load libraries; their time limit, s, and that of ffmpeg.
 AT_ONCE, TIMEOUT, FFMPEG_TIMEOUT = 2, 120.0, 20.0
-# Less disk is a fault, bytes.
+# Free disk space below which a directory is a fault, bytes.
 NO_DISK = 1e7
-# Packages, and what they are imported as.
+# Packages and their import names.
 PACKAGES = {name: name for name in ("pyvista", "pysplashsurf", "matplotlib", "h5py", "meshio", "trimesh")} | {
     "pillow": "PIL"
 }
@@ -36,14 +36,14 @@ Device = tuple[str, bool]
 NAME_LENGTH = 256
 # VkPhysicalDeviceProperties: offsets of deviceType and deviceName, an upper bound of its size, and the type of a CPU.
 VULKAN_TYPE, VULKAN_NAME, VULKAN_SIZE, VULKAN_CPU = 16, 20, 4096, 4
-# Words of 8 bytes of VkInstanceCreateInfo.
+# Size of VkInstanceCreateInfo in words of 8 bytes.
 INSTANCE_INFO_WORDS = 8
 VULKAN_LIBRARIES = {"linux": "libvulkan.so.1", "win32": "vulkan-1.dll", "darwin": "libvulkan.1.dylib"}
 
 
 @dataclass(frozen=True)
 class Check:
-    """One line of the report: `detail` is what was found, `remedy` what the user can do, "" for nothing."""
+    """One line of the report: `detail` is the finding, `remedy` the advice to the user, "" for none."""
 
     status: Literal["ok", "information", "broken"]
     detail: str
@@ -51,7 +51,7 @@ class Check:
 
 
 def python(version: tuple[int, int] = sys.version_info[:2]) -> Check:
-    """Examine the version of the interpreter."""
+    """Check the version of the interpreter."""
     detail = f"{platform.python_version()}, {sys.prefix}"
     if OLDEST <= version <= NEWEST:
         return Check("ok", detail)
@@ -60,19 +60,19 @@ def python(version: tuple[int, int] = sys.version_info[:2]) -> Check:
 
 
 def mpmcli() -> Check:
-    """Examine the package."""
+    """Return the version and the path of mpmcli."""
     return Check("ok", f"{__version__}, {Path(__file__).resolve().parent.parent}")
 
 
 def taichi(arch: str) -> Check:
-    """Examine a backend by starting it. A GPU that is not here is no fault."""
+    """Check a backend by starting it. A missing GPU is not a fault."""
     from mpmcli.solver.machine.backend import backend_is_here, try_backend
 
     if arch == "cpu":
         threads = try_backend("cpu").threads
         return Check("ok", f"Taichi {importlib.metadata.version('taichi')}, {counted(threads, 'thread')}")
     if not backend_is_here(arch):
-        return Check("information", "not here")
+        return Check("information", "not available")
     try_backend(arch)
     devices = device_names(arch)
     names = ", ".join(name for name, _ in devices) or "device of unknown name"
@@ -82,7 +82,7 @@ def taichi(arch: str) -> Check:
 
 
 def device_names(arch: str) -> list[Device]:
-    """Return the devices of a backend by its driver, as Taichi does not name them; empty if that cannot be queried."""
+    """Return the devices of a backend from its driver, because Taichi does not name them; empty if the query fails."""
     from mpmcli.solver.machine.backend import CUDA_LIBRARIES
 
     asked = {"cuda": (_cuda, CUDA_LIBRARIES), "vulkan": (_vulkan, VULKAN_LIBRARIES)}
@@ -129,7 +129,7 @@ def _vulkan(loader: ctypes.CDLL) -> list[Device]:
 
 
 def vtk() -> Check:
-    """Examine VTK by drawing a picture off screen."""
+    """Check VTK by drawing a picture off screen."""
     from mpmcli.render.window import choose_window
 
     name = choose_window()
@@ -145,13 +145,13 @@ def vtk() -> Check:
 
 
 def package(name: str, module: str) -> Check:
-    """Examine a package by importing it."""
+    """Check a package by importing it."""
     importlib.import_module(module)
     return Check("ok", importlib.metadata.version(name))
 
 
 def ffmpeg() -> Check:
-    """Examine ffmpeg by encoding one image as films are."""
+    """Check ffmpeg by encoding one image with the codec of films."""
     import imageio_ffmpeg
 
     program = imageio_ffmpeg.get_ffmpeg_exe()
@@ -161,7 +161,7 @@ def ffmpeg() -> Check:
 
 
 def writable(place: Path) -> Check:
-    """Examine a directory by making a file in it."""
+    """Check a directory by creating a file in it."""
     place.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryFile(dir=place):
         free = shutil.disk_usage(place).free
@@ -170,14 +170,14 @@ def writable(place: Path) -> Check:
 
 
 def memory() -> Check:
-    """Examine the memory of this machine."""
+    """Return the total and the free memory of this machine."""
     import psutil
 
     found = psutil.virtual_memory()
     return Check("ok", f"{size_text(found.total)}, {size_text(found.available)} free")
 
 
-# In the order of the report; a driver, or a cache, that is broken is no fault of what runs without it.
+# Checks in the order of the report. A broken OPTIONAL component is not a fault, because mpmcli runs without it.
 CHECKS: dict[str, Callable[[], Check]] = {
     "python": python,
     "mpmcli": mpmcli,
@@ -201,7 +201,7 @@ def run_check(name: str) -> Check:
 
 
 def examine(work: Callable[[str], Check] = run_check) -> Iterator[tuple[str, Check]]:
-    """Yield (name, result) of every check, in order, each in a process of its own, which may crash."""
+    """Yield (name, result) of every check, in order. Each runs in a separate process, which may crash."""
     ended: dict[str, Check] = {}
     waiting = list(CHECKS)
     for name, answer in in_processes(waiting, AT_ONCE, work, TIMEOUT):
@@ -212,13 +212,13 @@ def examine(work: Callable[[str], Check] = run_check) -> Iterator[tuple[str, Che
 
 
 def _fault(name: str, detail: str) -> Check:
-    """Return a fault, with the system library to install where one is missing."""
+    """Return a fault, with the system library to install if one is missing."""
     missed = re.search(r"(lib\w+)[\w.+-]*: cannot open shared object", detail)
-    remedy = "install mpmcli again"
+    remedy = "reinstall mpmcli"
     if missed:
-        remedy = f"install the system's package of {missed[1]}"
+        remedy = f"install the system package of {missed[1]}"
         if missed[1] in SYSTEM_PACKAGES:
             remedy += f", on Debian and Ubuntu by `apt-get install {SYSTEM_PACKAGES[missed[1]]}`"
     elif name.startswith("taichi ") and name != "taichi cpu":
-        remedy = "mend or remove the driver; --arch cpu runs without it"
+        remedy = "repair or remove the driver; --arch cpu runs without it"
     return Check("information" if name in OPTIONAL else "broken", " ".join(detail.split())[-300:], remedy)

@@ -1,4 +1,4 @@
-"""Draws the ledger of a run: energies, momenta, steps and what bounds them, volumes, speeds, and where matter is."""
+"""Draws the ledger of a run: energies, momenta, time steps and their limits, volumes, speeds, and extents."""
 
 import textwrap
 from collections.abc import Sequence
@@ -23,15 +23,15 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-FRAMES_MAX = 200  # frames whose positions are read; more would not be seen in the figure
+FRAMES_MAX = 200  # frames whose positions are read; more would not be visible in the figure
 BODIES_MAX = 6  # more bodies than this are shown as one
-NAMED = 5  # frames that a note names
-LABEL_WIDTH = 24  # characters in a line of a label beside the axis of values
-MARKED = 8  # fewer points than this are marked, since a single one makes no line
-FEW_DECADES = 2.5  # fewer decades than this have numbers at 2 and 5 times their powers, too
+NAMED = 5  # largest number of frames named in a note
+LABEL_WIDTH = 24  # characters in a line of a label of the vertical axis
+MARKED = 8  # fewer points than this have markers, because a single point makes no line
+FEW_DECADES = 2.5  # axes of fewer decades than this also have ticks at 2 and 5 times the powers of ten
 NAME_MAX = 16  # characters of a name in a legend
 TITLE_MAX = 64  # characters of the title of a scene
-COLLIDERS_MAX = 6  # more colliders than this are shown as one, and no more pairs of bodies
+COLLIDERS_MAX = 6  # more colliders than this are shown as one; largest number of pairs of bodies
 AXES = "xyz"
 # The order of the colours is that of the legend.
 LIMITS = ("wave", "speed", "force", "viscosity", "deformation", "forced", "maximum")
@@ -47,28 +47,28 @@ class History:
     status: str  # of the result
     columns: dict[str, np.ndarray]  # of the ledger, (T,) float64, momenta (T, components); NaN where it is not finite
     limits: tuple[str, ...]  # T names of the bound on the step, "" at the initial state
-    # How far the particles reach in some of the frames.
+    # Extents of the particles in some of the frames.
     reach_times: np.ndarray  # (F,) s
     names: tuple[str, ...]  # of B bodies, or one name for all of them
     lowest: np.ndarray  # (F, B, d) m, NaN where a body has no particle; `highest` alike
     highest: np.ndarray
-    notes: tuple[str, ...]  # sentences about what the figure does not show
+    notes: tuple[str, ...]  # sentences on data that the figure does not show
 
     @property
     def times(self) -> np.ndarray:
-        """(T,) s."""
+        """Times of the frames, (T,), s."""
         return self.columns["time"]
 
 
 def read_history(result: Result) -> History:
-    """Read what a figure of a result shows; InputError where a frame or the ledger is damaged."""
+    """Read the history of a result. Raises InputError if a frame or the ledger is damaged."""
     rows = result.ledger
     if len(rows) != result.frame_count:
         raise InputError(f"{result.path} is damaged: it has {result.frame_count} frames and {len(rows)} ledger rows.")
     columns, broken = {}, []
     for name in (entry.name for entry in fields(LedgerRow) if entry.name != TEXT):
         if rows and getattr(rows[0], name) is None:
-            # Of scenes in which particles come and go.
+            # Only ledgers of scenes in which particles enter and leave have this column.
             continue
         values = np.array([getattr(row, name) for row in rows], dtype=np.float64)
         columns[name] = np.where(np.isfinite(values), values, np.nan)
@@ -104,7 +104,7 @@ def read_history(result: Result) -> History:
 
 
 def _extent(frame: Frame, label: int | None) -> np.ndarray:
-    """Return the lowest and the highest coordinates of a body, or of all, that are finite: (2, d)."""
+    """Return the lowest and the highest finite coordinates of a body, or of all bodies, (2, d), m."""
     position = frame.position.astype(np.float64)
     kept = np.isfinite(position).all(1)
     if label is not None:
@@ -124,7 +124,7 @@ def ledger_picture(history: History, size: tuple[int, int], theme: ThemeName) ->
 def draw_ledger(figure: "Figure", history: History, theme: ThemeName) -> list[str]:
     """Draw a run into an empty figure and return the titles of its panels, in the order of its axes."""
     d = history.header.dimension
-    # Each row for itself, as they differ in their number of panels.
+    # Each row has its own grid, because the rows differ in their number of panels.
     colliders, contacts = history.header.collider_names, [" on ".join(pair[::-1]) for pair in history.header.contacts]
     counts = (4, 4, d) + (d,) * bool(colliders) + (d,) * bool(contacts)
     rows = figure.add_gridspec(len(counts), 1)
@@ -152,12 +152,12 @@ def _shortened(text: str, length: int) -> str:
 
 
 def _first(values: np.ndarray) -> int:
-    """Return the number of the first row that is known, which changes are counted from."""
+    """Return the index of the first finite row, the reference of changes."""
     return int(np.isfinite(values).reshape(len(values), -1).all(1).argmax())
 
 
 class Panel:
-    """Axes with the times (T,), s, of the values along x; colours go by number, None is that of the text."""
+    """Axes with the times (T,), s, of the values along x; colours are given by index, None is that of the text."""
 
     def __init__(self, axes: "Axes", times: np.ndarray, theme: Theme) -> None:
         self.axes, self._times, self._theme = axes, times, theme
@@ -176,7 +176,7 @@ class Panel:
         self.axes.plot(self._times if times is None else times, values, marker=marker, markersize=3.5, **keywords)
 
     def steps(self, values: np.ndarray, color: int | None, name: str = "") -> None:
-        """Draw values (T,) that hold from the frame before to each frame."""
+        """Draw values (T,), each constant from the previous frame to its own."""
         keywords = {"color": self._color(color), "linewidth": 1.4, "label": self._name(name)}
         self.axes.step(self._times[1:], values[1:], where="pre", **keywords)
 
@@ -190,7 +190,7 @@ class Panel:
     def between_frames(
         self, low: np.ndarray, high: np.ndarray, chosen: np.ndarray, name: str, color: int | None
     ) -> None:
-        """Fill from low to high in the time before each chosen frame, (T,) bool."""
+        """Fill from low to high in the interval before each chosen frame, (T,) bool."""
         from matplotlib.collections import PolyCollection
 
         ends = np.flatnonzero(chosen & np.isfinite(low) & np.isfinite(high))
@@ -198,25 +198,25 @@ class Panel:
         left, right, bottom, top = self._times[ends - 1], self._times[ends], low[ends], high[ends]
         corners = [np.stack(corner, -1) for corner in ((left, bottom), (right, bottom), (right, top), (left, top))]
         shown = self._color(color)
-        # The edge is seen where the band has no height.
+        # The edge shows bands of zero height.
         boxes = PolyCollection(np.stack(corners, 1), facecolor=shown, edgecolor=shown, linewidth=1.6, label=name)
         boxes.set_capstyle("butt")
         self.axes.add_collection(boxes)
         self.axes.update_datalim(np.concatenate(corners))
 
     def level(self, value: float, name: str = "", color: int | None = None) -> None:
-        """Draw a dashed line at a value that means something, faint where it has no colour."""
+        """Draw a dashed reference line at a value, faint if `color` is None."""
         shown = self._theme.faint if color is None else self._color(color)
         keywords = {"linestyle": (0, (4, 2.5)), "linewidth": 1.0, "zorder": 1.5}
         self.axes.axhline(value, color=shown, label=self._name(name), **keywords)
 
     def note(self, text: str) -> None:
-        """Write a text in the middle, where nothing is drawn."""
+        """Write a text in the middle of an empty panel."""
         place = {"transform": self.axes.transAxes, "ha": "center", "va": "center"}
         self.axes.text(0.5, 0.5, text, color=self._theme.faint, **place)
 
     def logarithmic(self, *values: np.ndarray) -> None:
-        """Scale positive values logarithmically, over three quarters of a decade at least."""
+        """Scale positive values logarithmically, over at least three quarters of a decade."""
         from matplotlib.ticker import LogLocator
 
         positive = np.concatenate([series[series > 0] for series in values])
@@ -230,7 +230,7 @@ class Panel:
             self.axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
 
     def finish(self) -> None:
-        """Set the limits of the times, the form of the numbers, and the legend."""
+        """Set the limits of the times, the format of the numbers, and the legend."""
         from matplotlib.ticker import FuncFormatter, NullFormatter
 
         axes = self.axes
@@ -251,7 +251,7 @@ class Panel:
         return self._theme.ink if color is None else self._theme.series[color % len(self._theme.series)]
 
     def _name(self, name: str) -> str:
-        # matplotlib leaves out of legends what begins with a line below.
+        # Matplotlib omits labels that begin with an underscore from legends.
         return _shortened(name, NAME_MAX).lstrip("_") or "_"
 
 
@@ -275,19 +275,19 @@ def _energy(parts: Panel, change: Panel, history: History) -> None:
 
 
 def _momenta(linear: Panel, angular: Panel, history: History) -> None:
-    """Draw what gravity does not explain of the momentum, 0 until something else acts, and the angular momentum."""
+    """Draw the momentum without that of gravity, 0 until another force acts, and the angular momentum."""
     header, columns = history.header, history.columns
     momentum = columns["linear_momentum"]
     start = _first(momentum)
     values = momentum - momentum[start]
-    # In the plane they are per metre of depth.
+    # In 2D they are per metre of depth.
     unit, angular_unit = ("N s/m", "N s") if header.dimension == 2 else ("N s", "N m s")
     if header.gravity is None:
         linear.title("Momentum (gravity is not constant)", f"P - P₀, {unit}")
     else:
         what = listed(["walls", *["colliders"] * bool(header.collider_names), *["forces"] * header.driven], "and")
         linear.title(f"Impulse of the {what}", f"P - P₀ - M g t, {unit}")
-        # Velocities are those of the middle of the last step.
+        # Velocities are those at the middle of the last step.
         middle = history.times - (columns["step_min"] + columns["step_max"]) / 4
         values = values - columns["mass"][:, None] * header.gravity * (middle - middle[start])[:, None]
     for axis in range(header.dimension):
@@ -295,14 +295,14 @@ def _momenta(linear: Panel, angular: Panel, history: History) -> None:
     linear.level(0.0)
     moments = columns["angular_momentum"]
     angular.title("Angular momentum", f"about the domain's corner, {angular_unit}")
-    # In the plane there is one component, about z.
+    # In 2D there is one component, about z.
     for axis, component in zip(range(3)[-moments.shape[1] :], moments.T, strict=True):
         angular.line(component, AXES[axis], axis)
     angular.level(0.0)
 
 
 def _steps(length: Panel, courant: Panel, history: History) -> None:
-    length.title("Time step, by what bounds it", "smallest to largest, s")
+    length.title("Time step, by limit", "smallest to largest, s")
     shortest, longest = history.columns["step_min"], history.columns["step_max"]
     names = [name for name in LIMITS if name in history.limits]
     names += sorted(set(history.limits) - {"", *LIMITS})
@@ -339,9 +339,9 @@ def _reach(panel: Panel, history: History, axis: int) -> None:
 
 
 def _load(panel: Panel, history: History, axis: int, what: str, names: Sequence[str]) -> None:
-    """Draw mean forces between frames, on each collider, of many on all, or of the pairs of bodies with the largest."""
+    """Draw mean forces between frames: on each collider or all together, or of the pairs of bodies with the largest."""
     unit = "N/m" if history.header.dimension == 2 else "N"
-    panel.title(f"Force on {what} along {AXES[axis]}", f"mean since the frame before, {unit}")
+    panel.title(f"Force on {what} along {AXES[axis]}", f"mean since the previous frame, {unit}")
     forces = history.columns["collider_force" if what == "colliders" else "contact_force"]
     if forces.ndim != 3:
         panel.note("not in this ledger")

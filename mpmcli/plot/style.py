@@ -1,4 +1,4 @@
-"""The style of figures: colours that colour-blind people can distinguish, on light and on dark."""
+"""The style of figures: colours for colour-blind readers, on light and on dark ground."""
 
 import warnings
 from collections.abc import Iterator
@@ -14,15 +14,15 @@ from mpmcli.render.settings import ThemeName
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-# Pixels per inch of a figure of AREA pixels; others are the same figure, larger or smaller.
+# Pixels per inch of a figure of AREA pixels; figures of other sizes are scaled.
 DPI, AREA = 100.0, 1200 * 900
-# Settings of matplotlib that all figures share, and those of figures of ledgers.
+# Matplotlib style sheets of all figures and of figures of ledgers.
 SHARED, LEDGER = (Path(__file__).with_name(f"{name}.mplstyle") for name in ("shared", "ledger"))
 
 
 @dataclass(frozen=True)
 class Theme:
-    """Colours of a figure; the names follow what they are used for."""
+    """Colours of a figure, named by their use."""
 
     ground: str
     panel: str
@@ -44,9 +44,10 @@ THEMES: dict[ThemeName, Theme] = {
 def empty_figure(
     inches: tuple[float, float], sheet: Path, settings: dict[str, Any], pads: tuple[float, float], dpi: float = DPI
 ) -> "Iterator[Figure]":
-    """Provide an empty figure to draw on, independent of the user's settings of matplotlib.
+    """Yield an empty figure, independent of the user's matplotlib settings.
 
-    `sheet` and `settings` are of matplotlib, after those of `SHARED`; `pads` are around panels, across and up, inches.
+    `SHARED`, the style sheet `sheet` and `settings` are applied in this order. `pads` are the horizontal and vertical
+    padding of panels, inches.
     """
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -64,9 +65,9 @@ def empty_figure(
 
 
 def drawing(size: tuple[int, int], theme: Theme) -> "AbstractContextManager[Figure]":
-    """Return an empty figure of a size in pixels, (width, height), as a context; its text grows with the size."""
+    """Return a context with an empty figure of a size in pixels, (width, height); its text scales with the size."""
     dpi = DPI * (size[0] * size[1] / AREA) ** 0.5
-    # A hundredth of a pixel more, since the canvas rounds down.
+    # A hundredth of a pixel is added, because the canvas rounds down.
     inches = (size[0] + 0.01) / dpi, (size[1] + 0.01) / dpi
     settings = {
         **dict.fromkeys(("axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color"), theme.faint),

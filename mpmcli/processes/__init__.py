@@ -1,1 +1,1 @@
-"""Processes of our own: questions with one answer each, and pools that carry out many tasks of one job."""
+"""Child processes: one process per task, and pools for the many tasks of one job."""

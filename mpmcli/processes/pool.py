@@ -1,6 +1,6 @@
-"""Tasks in other processes: each in one of its own, or many of one job, such as the frames of a film, in a few.
+"""Tasks in child processes: one process per task, or a pool for the tasks of one job, such as the frames of a film.
 
-In a process of its own the crash of one task, or its being late, is that of no other.
+With one process per task, a crash or a timeout of a task does not affect the others.
 """
 
 import multiprocessing
@@ -20,19 +20,19 @@ from mpmcli.cores import available_cores
 from mpmcli.errors import RunError
 
 T = TypeVar("T")
-# Taichi starts once in a process, in one precision, and must not be forked.
+# Taichi is initialized once in a process, in one precision, and must not be forked.
 SPAWN = get_context("spawn")
-# Between two looks at which tasks have ended, s.
+# Interval of polling for tasks that have ended, s.
 LOOK = 0.1
 
 
 @contextmanager
 def interrupts_blocked() -> Iterator[None]:
-    """Block SIGINT for all that is started here: Ctrl-C reaches all processes, and this one ends the others."""
+    """Block SIGINT in processes started in this context: Ctrl-C reaches all, and this process ends the others."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
-    # The first process starts this, which unblocks the signal.
+    # The first process would start the tracker, which unblocks the signal.
     resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
     try:
@@ -43,7 +43,7 @@ def interrupts_blocked() -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Fault:
-    """Why there is no answer, such as "its process ended with exit code 3"."""
+    """The reason of a missing result, such as "its process ended with exit code 3"."""
 
     words: str
 
@@ -55,12 +55,12 @@ def in_processes(
     timeout: float,
     stop: Callable[[], object] = lambda: False,
 ) -> Iterator[tuple[T, Any]]:
-    """Yield (task, work(task) or a Fault) as processes end, `workers` at a time. None is left when this ends.
+    """Yield (task, work(task) or a Fault) as processes end, `workers` at a time. No process is left when this ends.
 
     Args:
-        work: what a process does, a function of a module; what libraries print there appears nowhere.
-        timeout: of a task, s.
-        stop: polled; where it returns True, KeyboardInterrupt is raised.
+        work: function of a module that each process calls; output of libraries there is discarded.
+        timeout: time limit of a task, s.
+        stop: polled; if it returns True, KeyboardInterrupt is raised.
     """
     waiting, going = list(reversed(tasks)), {}
     try:
@@ -103,7 +103,7 @@ def _end_one(answers: connection.Connection, process: SPAWN.Process) -> None:
 
 
 def silence() -> None:
-    """Let nothing of what libraries print in this process appear."""
+    """Discard the output of this process, including that of libraries."""
     silent = os.open(os.devnull, os.O_WRONLY)
     os.dup2(silent, 1)
     os.dup2(silent, 2)
@@ -118,11 +118,11 @@ def _answer(work: Callable[[T], Any], task: T, answers: connection.Connection) -
     answers.send(answer)
 
 
-# Seconds between two looks at whether to stop.
+# Interval of polling `stop`, s.
 PAUSE = 0.05
-# Seconds in which a process may clean up before it is killed.
+# Time in which a process may clean up before it is killed, s.
 GRACE = 2.0
-# How many threads the software renderer, numpy, splashsurf and VTK take.
+# Variables with the number of threads of the software renderer, NumPy, splashsurf and VTK.
 THREADS = (
     "LP_NUM_THREADS",
     "OMP_NUM_THREADS",
@@ -134,10 +134,10 @@ THREADS = (
 
 
 class Job(Protocol):
-    """What is rendered: of a module that can be imported, since it is pickled."""
+    """A rendering job. Its class must be importable, because jobs are pickled."""
 
     def start(self) -> Callable[[int], Any]:
-        """Return what renders one frame and writes it; called once in each process."""
+        """Return a function that renders and writes one frame; called once in each process."""
         ...
 
 
@@ -149,22 +149,22 @@ def render_frames(
     watch: Callable[[int, Any], None] = lambda k, outcome: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> None:
-    """Render frames, in this process where one is asked for or one frame is left, and otherwise in others.
+    """Render frames, in this process for one worker or one frame, otherwise in child processes.
 
-    The processes share the cores: each gets its part in the variables of THREADS that the environment does not set.
-    What libraries print there appears nowhere, and Ctrl-C at the terminal does not reach them. None is left when this
-    returns or raises; frames that are done stay.
+    The processes share the cores: each gets its share in the variables of THREADS that the environment does not set.
+    Output of libraries there is discarded, and the processes ignore Ctrl-C. No process is left when this returns or
+    raises; finished frames are kept.
 
     Args:
-        ks: the frames, begun in this order.
+        ks: the frames, which are started in this order.
         workers: processes at a time, each with one frame.
-        watch: called with each frame as it is done, and what the job returned for it, which can be pickled.
-        stop: called again and again; returns whether to end.
+        watch: called with each finished frame and the result of the job for it, which must be picklable.
+        stop: polled; returns whether to end.
 
     Raises:
         KeyboardInterrupt: `stop` returned True.
-        RunError: a process was ended from outside, or crashed.
-        Exception: whatever the job raises, as itself.
+        RunError: a process was killed or crashed.
+        Exception: any exception of the job.
     """
     count = min(workers, len(ks))
     if count > 1:
@@ -181,7 +181,7 @@ def _render_beside(
     job: Job, ks: Sequence[int], count: int, watch: Callable[[int, Any], None], stop: Callable[[], bool]
 ) -> None:
     others = set(multiprocessing.active_children())
-    # Libraries read these where they are loaded, which the job is with.
+    # Libraries read these variables when they are loaded, together with the job.
     share = str(max(1, available_cores() // count))
     threads = {name: share for name in THREADS if name not in os.environ}
     pool = ProcessPoolExecutor(count, SPAWN, _begin, (job,))
@@ -202,8 +202,8 @@ def _render_beside(
         if stop():
             raise KeyboardInterrupt from None
         raise RunError(
-            "A process that rendered frames was ended, or crashed; frames that are done are kept, and fewer --workers "
-            "need less memory."
+            "A process that rendered frames was killed or crashed. Finished frames are kept; fewer --workers need "
+            "less memory."
         ) from None
     finally:
         _end([process for process in multiprocessing.active_children() if process not in others])
@@ -211,7 +211,7 @@ def _render_beside(
 
 
 def _end(processes: Sequence[multiprocessing.Process]) -> None:
-    """End all processes, whatever they are doing."""
+    """Terminate all processes, and kill those that have not ended after GRACE."""
     try:
         for process in processes:
             process.terminate()
@@ -222,24 +222,24 @@ def _end(processes: Sequence[multiprocessing.Process]) -> None:
             process.kill()
 
 
-# Of a process: its job, and what that starts.
+# State of a child process: its job, and the function that `Job.start` returned.
 _job: Job
 _render_frame: Callable[[int], Any] | None = None
 
 
 def _begin(job: Job) -> None:
-    """Prepare a process."""
+    """Prepare a child process."""
     global _job
     _job = job
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    # KeyboardInterrupt, as no handler of errors must stop it.
+    # SIGTERM raises KeyboardInterrupt, which handlers of errors do not catch.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     silence()
     threading.Thread(target=_follow, daemon=True).start()
 
 
 def _follow() -> None:
-    """End with the process that started this one: it may be killed."""
+    """End this process when its parent ends, which may be killed."""
     connection.wait([multiprocessing.parent_process().sentinel])
     os._exit(1)
 
@@ -251,5 +251,5 @@ def _render(k: int) -> Any:
             _render_frame = _job.start()
         return _render_frame(k)
     except KeyboardInterrupt:
-        # What was unfinished is removed; the pool would go on with the next frame.
+        # Unfinished files have been removed; the pool would continue with the next frame.
         os._exit(1)

@@ -14,13 +14,13 @@ from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.scene import Scene
 
-Tables = dict[str, Any]  # of a scene, as in a TOML file
+Tables = dict[str, Any]  # tables of a scene, as in a TOML file
 Level = Literal["coarse", "default", "fine"]
 Levels = dict[Level, tuple[int, ...]]
 Frames = Iterable[tuple[Frame, LedgerRow]]
-# Of a measure, as the report prints it.
+# Format of the definition of a measure.
 DEFINITION = re.compile(r"(?P<name>[^(:]+?)(?: \((?P<unit>.+?)\))?: (?P<text>.+)")
-# The values of each field of `Setting` that are tried, and their labels.
+# Values of each field of `Setting` in the validation, and their labels.
 KNOBS: dict[str, dict[object, str]] = {
     "precision": {"f64": "f64", "f32": "f32"},
     "kernel": {"quadratic": "quadratic kernel", "cubic": "cubic kernel"},
@@ -32,10 +32,10 @@ KNOBS: dict[str, dict[object, str]] = {
 
 @dataclass(frozen=True)
 class Setting:
-    """Numerical settings, which trade speed against error. The defaults are those of a scene, but for double precision.
+    """Numerical settings. The defaults are those of a scene, except for double precision.
 
-    `per_axis` is the number of particles per cell and axis, `safety` the time step over the stability limit (Courant
-    fraction).
+    `per_axis` is the number of particles per cell and axis, `safety` the ratio of the time step to the stability limit
+    (Courant fraction).
     """
 
     precision: str = "f64"
@@ -46,7 +46,7 @@ class Setting:
 
     @property
     def label(self) -> str:
-        """The differences from the default setting."""
+        """Differences from the default setting, or "default"."""
         changed = [(knob, value) for knob, value in asdict(self).items() if value != getattr(Setting(), knob)]
         return ", ".join(KNOBS[knob].get(value, f"{knob} {value}") for knob, value in changed) or "default"
 
@@ -61,9 +61,9 @@ class Measure:
     # The smallest admissible order of convergence of |value| between the two finest resolutions.
     order: float | None = None
     expected: float | None = None  # the theoretical order, shown in the report
-    # The finest resolution used for the order. At finer ones another error dominates, as the note of the case explains.
+    # The finest resolution used for the order. At finer ones another error dominates; see the note of the case.
     order_to: float = math.inf
-    # The |value| that rounding alone may make in single precision; a larger one may be 1.2 times that of double.
+    # The |value| that rounding alone may cause in single precision; the bound is 1.2 times this or that in double.
     rounding: float | Callable[[int], float] = 1e-4
 
     name: str = field(init=False)
@@ -79,18 +79,18 @@ class Measure:
         return self.limit(n) if callable(self.limit) else self.limit
 
     def rounding_at(self, n: int) -> float:
-        """Return the |value| that rounding alone may make in single precision at resolution n."""
+        """Return the |value| that rounding alone may cause in single precision at resolution n."""
         return self.rounding(n) if callable(self.rounding) else self.rounding
 
     @property
     def unit_suffix(self) -> str:
-        """The unit after a blank, or nothing."""
+        """The unit after a space, or an empty string."""
         return f" {self.unit}" if self.unit else ""
 
 
 @dataclass(frozen=True)
 class CaseText:
-    """What the report says of a case, from `page/cases.toml`; `measures` are sentences by "name" or "name (unit)"."""
+    """Text of a case in the report, from `page/cases.toml`; `measures` maps "name" or "name (unit)" to a sentence."""
 
     source: str = ""
     resolution: str = ""
@@ -98,17 +98,17 @@ class CaseText:
     measures: dict[str, str] = field(default_factory=dict)
 
     def measure(self, name: str, *bounds: Any, **more: Any) -> Measure:
-        """Return a measure by "name" or "name (unit)", with its sentence, and with what else a `Measure` takes."""
+        """Return the measure "name" or "name (unit)" with its sentence; other arguments are those of `Measure`."""
         return Measure(f"{name}: {self.measures[name]}", *bounds, **more)
 
     def filled(self, **facts: Any) -> "CaseText":
-        """Return the text with facts in place of the {names} in its note and its sentences."""
+        """Return the text with the {names} in its note and its sentences replaced by facts."""
         measures = {name: sentence.format(**facts) for name, sentence in self.measures.items()}
         return replace(self, note=self.note.format(**facts), measures=measures)
 
 
 def case_text(name: str) -> CaseText:
-    """Return the text of a case, or of several that share theirs."""
+    """Return the text of a case, or of a group of cases that share it."""
     return CaseText(**_texts()[name])
 
 
@@ -131,10 +131,10 @@ class Case(ABC):
     varies: ClassVar[tuple[str, ...]] = ("precision", "kernel", "transfer", "per_axis", "safety")
     finer: ClassVar[int] = 1  # factor on the particles per cell and axis of the setting
     solids: str = "updated"  # grid of elastic bodies, as in a scene
-    f_bar: ClassVar[bool | str] = "auto"  # whether volumes are averaged over cells, as in a scene
+    f_bar: ClassVar[bool | str] = "auto"  # whether volume changes are averaged over cells, as in a scene
     note: ClassVar[str] = ""  # remarks on the result, such as the origin of a bound
 
-    text: ClassVar[CaseText]  # of a class that has one: its source, resolution and note are those of the case
+    text: ClassVar[CaseText]  # if a class has it, its source, resolution and note become those of the case
 
     def __init_subclass__(cls) -> None:
         for name in ("source", "resolution", "note"):
@@ -143,7 +143,7 @@ class Case(ABC):
 
     @abstractmethod
     def tables(self, n: int) -> Tables:
-        """Return the problem at resolution n, as the tables of a scene; `scene_tables` adds those of the setting."""
+        """Return the tables of the scene at resolution n without the setting, which `scene_tables` adds."""
 
     def scene_tables(self, n: int, setting: Setting) -> Tables:
         """Return the scene at resolution n, as the tables of a TOML file."""
@@ -160,4 +160,4 @@ class Case(ABC):
 
     @abstractmethod
     def measure(self, n: int, scene: Scene, frames: Frames) -> dict[str, float]:
-        """Return the value of each measure by name from the frames of a run of the scene, consumed in order."""
+        """Return the value of each measure by name. The frames of a run of the scene are consumed in order."""

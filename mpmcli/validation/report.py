@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 TEMPLATE = Path(__file__).parent / "page" / "report.md"
-# Columns of the table of cases, of that of settings, and of that of runs around the measures.
+# Columns of the tables of cases and of settings, and of the table of runs before and after the measures.
 CASES = ("case", "problem", "verdict", "error", "at n", "order (expected)", "seconds")
 SETTINGS = ("setting", "error", "seconds", "runs that failed")
 RUN, COSTS = ("setting", "n"), ("particles", "steps", "seconds", "M particle-steps/s", "compile s", "outcome")
-# The figures: their size, inches, and their style.
+# Size of the figures, inches, and their style.
 SIZE = (10.0, 4.8)
 STYLE = Path(__file__).parent / "page" / "figures.mplstyle"
 # Ordinate of a zero error.
@@ -32,7 +32,7 @@ LOWEST = 1e-17
 COURANT = "Courant fraction"
 GREY = {"color": "#777777", "linewidth": 1.0, "linestyle": ":"}
 VARIANTS = [variant.label for knob in KNOBS if knob != "safety" for variant in variants(knob)]
-# Lines of the settings, the same in every figure; single precision usually coincides with double.
+# Styles of the lines of settings, the same in every figure; single precision usually coincides with double.
 LOOKS: dict[str, dict[str, Any]] = {Setting().label: {"color": "black", "marker": "o", "linewidth": 2.0, "zorder": 3}}
 LOOKS |= {
     label: {"color": color, "marker": marker, "linewidth": 1.2}
@@ -55,7 +55,7 @@ class CaseReport:
         return judge(self.case, self.results)
 
     def summary(self) -> tuple[str, ...]:
-        """Return the row of the case in the table of cases: its finest run with the default setting that finished."""
+        """Return the row of the case in the table of cases, for its finest finished run with the default setting."""
         measure = self.case.measures[0]
         observed = order_of(measure, self.results)
         order = "" if observed is None else f"{observed:.2f}"
@@ -118,7 +118,7 @@ class CaseReport:
 
 @dataclass(frozen=True)
 class Report:
-    """All cases of one run of the validation. `environment` has the machine, its versions, the workers and the date."""
+    """A report on cases. `environment` has the machine, the versions, the number of workers and the date."""
 
     level: Level
     environment: dict[str, Any]
@@ -135,11 +135,11 @@ class Report:
 
     @property
     def passed(self) -> bool:
-        """Whether every case came out as it should."""
+        """Whether every case passes."""
         return not self.reasons()
 
     def reasons(self) -> list[str]:
-        """Return sentences of the failed checks, each after the name of its case."""
+        """Return the sentences of the failed checks, each preceded by the name of its case."""
         return [f"{entry.case.name}: {reason}" for entry in self.case_reports for reason in entry.verdict.reasons]
 
     def as_dict(self) -> dict[str, Any]:
@@ -148,7 +148,7 @@ class Report:
         return {"level": self.level, "environment": self.environment, "passed": self.passed, "cases": cases}
 
     def outcome(self) -> str:
-        """Return a sentence on how many cases pass and how many runs did not finish."""
+        """Return a sentence with the numbers of cases that pass and of runs that did not finish."""
         passed = sum(not entry.verdict.reasons for entry in self.case_reports)
         unfinished = sum(not result.finished for result in self.results.values())
         failed = f", of which {unfinished} did not finish" if unfinished else ""
@@ -162,7 +162,7 @@ class Report:
         return "\n\n".join(filter(None, [table, failed, closing]))
 
     def settings(self) -> str:
-        """Return a table of error and time of every setting over those of the default one at equal n, as Markdown."""
+        """Return a Markdown table of the ratios of error and time of each setting to the default one at equal n."""
         rows = []
         measure = {case.name: case.measures[0].name for case in self.cases}
         for setting in dict.fromkeys(run.setting for run in self.results if run.setting != Setting()):
@@ -183,7 +183,7 @@ class Report:
             f"{counted(facts['workers'], 'run')} at a time; Python {facts['python']}, Taichi {facts['taichi']}, "
             f"{facts['system']}."
         )
-        failed = f"## What failed\n\n{bullets(self.reasons())}\n\n" if self.reasons() else ""
+        failed = f"## Failed checks\n\n{bullets(self.reasons())}\n\n" if self.reasons() else ""
         return TEMPLATE.read_text(encoding="utf-8").format(
             machine=machine,
             outcome=self.outcome(),
@@ -195,7 +195,7 @@ class Report:
 
 
 def write_report(report: Report, directory: Path) -> None:
-    """Write the page and its figures into an existing directory, each file atomically; RunError where that fails."""
+    """Write the page and its figures into an existing directory, each file atomically. Raises RunError on failure."""
     try:
         (directory / FIGURES).mkdir(exist_ok=True)
         for entry in report.case_reports:
@@ -207,7 +207,7 @@ def write_report(report: Report, directory: Path) -> None:
 
 
 def _ratios(pairs: Iterable[tuple[float, float]], least: float) -> str:
-    """Return the geometric mean of the ratios of pairs, the smallest and the largest, where both are above `least`."""
+    """Return the geometric mean, minimum and maximum of the ratios of pairs with both values above `least`."""
     ratios = [a / b for a, b in pairs if min(a, b) > least]
     if not ratios:
         return ""
@@ -221,7 +221,7 @@ def bullets(lines: Iterable[str]) -> str:
 
 
 def draw_case(case: Case, results: Results) -> bytes:
-    """Return the figure of a case: error against resolution and processor time, as SVG; equal results, equal bytes."""
+    """Return the figure of a case as SVG: error against resolution and processor time. The bytes are reproducible."""
     measure = case.measures[0]
     with empty_figure(SIZE, STYLE, {}, (0.1, 0.1)) as figure:
         order, cost = figure.subplots(1, 2, sharey=True, subplot_kw={"xscale": "log", "yscale": "log"})
@@ -247,7 +247,7 @@ def draw_case(case: Case, results: Results) -> bytes:
 
 
 def _lines(results: Results) -> dict[str, Results]:
-    """Return the results of each line, by its label; Courant fractions share one."""
+    """Return the results of each line of the figure by label; all Courant fractions share a line."""
     lines: dict[str, Results] = {}
     for run, result in results.items():
         label = COURANT if run.setting.label.startswith(COURANT) else run.setting.label
@@ -256,7 +256,7 @@ def _lines(results: Results) -> dict[str, Results]:
 
 
 def _draw_bounds(axes: "Axes", case: Case, results: Results) -> None:
-    """Draw the bounds of the default setting, and the slope that theory expects below its finest error."""
+    """Draw the bounds of the default setting, and the slope of the expected order below its finest error."""
     measure, observed = case.measures[0], order_of(case.measures[0], results)
     usual = {run.n: result for run, result in results.items() if run.setting == Setting()}
     bounds = [(n, measure.bound(n)) for n in usual if 0 < measure.bound(n) < float("inf")]

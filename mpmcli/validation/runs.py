@@ -1,4 +1,4 @@
-"""The runs of a level, each case at its resolutions and settings, carried out in processes of their own, and kept."""
+"""The runs of a level: each case at its resolutions and settings, in separate processes, with stored results."""
 
 import hashlib
 import json
@@ -29,7 +29,7 @@ from mpmcli.validation.cases import all_cases
 
 PACKAGE = Path(__file__).resolve().parent.parent
 RESULTS, PAGE, FIGURES = "results.json", "report.md", "figures"
-# Numpy in the process of a run takes one thread, so that concurrent runs do not compete for cores.
+# NumPy uses one thread in the process of a run, so that concurrent runs do not compete for cores.
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
@@ -85,7 +85,7 @@ class RunResult:
 
     @property
     def finished(self) -> bool:
-        """Whether the run finished; only then are there values."""
+        """Whether the run finished; only finished runs have values."""
         return self.status == "finished"
 
     @property
@@ -102,14 +102,14 @@ Results = Mapping[Run, RunResult]
 
 
 def scene_of(case: Case, n: int, setting: Setting) -> Scene:
-    """Return the scene of a case at resolution n; InputError where it is not valid."""
+    """Return the scene of a case at resolution n. Raises InputError if it is not valid."""
     return parse_scene(case.scene_tables(n, setting), laws=parameter_models(), source=f"<{case.name}>").scene
 
 
 def carry_out(case: Case, n: int, setting: Setting, backend: Backend | None = None) -> RunResult:
     """Run a case and return its measures; errors are reported in the result.
 
-    Without a backend that of the CPU is started, with one thread in the precision of the setting.
+    If `backend` is None, the CPU backend is started with one thread and the precision of the setting.
     """
     try:
         scene = scene_of(case, n, setting)
@@ -136,14 +136,14 @@ def carry_out(case: Case, n: int, setting: Setting, backend: Backend | None = No
 
 
 class SteppingClock:
-    """Measures the processor time of the steps of a run, in s, which excludes the time of other programs."""
+    """Measures the processor time of the steps of a run, s. It excludes the time of other programs."""
 
     def __init__(self, run: SolverRun) -> None:
         self.seconds = 0.0
         self._run = run
 
     def frames(self) -> Iterator[tuple[Frame, LedgerRow]]:
-        """Yield the frames. Compiling, and what the caller does with frames, is not counted."""
+        """Yield the frames. Compilation and the caller's processing of the frames are not counted."""
         self._run.begin()
         frames = self._run.frames()
         while True:
@@ -170,17 +170,17 @@ def carry_out_all(
     stop: Callable[[], object] = lambda: False,
     work: Callable[[Run], RunResult] = carry_out_run,
 ) -> Iterator[tuple[Run, RunResult]]:
-    """Yield (run, result) as runs end; see `in_processes`. A crash, or more than `timeout` s, is reported."""
+    """Yield (run, result) as runs end; see `in_processes`. A run that crashes or exceeds `timeout` s has failed."""
     os.environ.update(ONE_THREAD)
     for run, answer in in_processes(runs, workers, work, timeout, stop):
         yield run, RunResult("failed", f"The run failed: {answer.words}.") if isinstance(answer, Fault) else answer
 
 
 class Journal:
-    """The results of earlier runs in the directory of a report, by the digest of all that a run depends on."""
+    """The stored results of earlier runs in the directory of a report, by `run_key`."""
 
     def __init__(self, directory: Path, *, resume: bool = False, overwrite: bool = False) -> None:
-        """Make the directory, or read the results in it, or clear it; InputError where it cannot be used."""
+        """Create the directory, and clear it or read its results. Raises InputError if it cannot be used."""
         check_directory(directory, overwrite, resume=resume)
         self._file = directory / RESULTS
         self._kept: dict[str, dict] = {}
@@ -196,12 +196,12 @@ class Journal:
             raise InputError(f"{directory} cannot be used ({reason}): give another place with -o.") from error
 
     def find(self, run: Run) -> RunResult | None:
-        """Return the result of a run by the same program on this processor; None for a failure, such as a late run."""
+        """Return the stored result of a run by the same program on this processor; None if absent or failed."""
         found = self._kept.get(run_key(run))
         return None if found is None or found["status"] == "failed" else RunResult(**found)
 
     def keep(self, run: Run, result: RunResult) -> None:
-        """Store the result of a run; RunError where that fails."""
+        """Store the result of a run. Raises RunError if the file cannot be written."""
         self._kept[run_key(run)] = asdict(result)
         try:
             write_text(self._file, json.dumps(self._kept, indent=1) + "\n")
@@ -210,7 +210,7 @@ class Journal:
 
 
 def run_key(run: Run) -> str:
-    """Return the digest of a run: its case, its scene, the program, and the processor, on which times depend."""
+    """Return the digest of the case, n, the scene, the program and the processor, on which times depend."""
     scene = all_cases()[run.case].scene_tables(run.n, run.setting)
     return hashlib.sha256(json.dumps([run.case, run.n, scene, *_program()]).encode()).hexdigest()
 

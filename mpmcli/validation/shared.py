@@ -1,4 +1,4 @@
-"""What cases share: tables of scenes, all in SI units, reference data, and what is measured in frames."""
+"""Shared parts of the cases: tables of scenes in SI units, reference data, and measurements on frames."""
 
 import math
 import tomllib
@@ -15,16 +15,16 @@ from mpmcli.scene import Scene
 from mpmcli.solver.transfer.kept_motion import OWN_STEP
 from mpmcli.validation.case import Frames, Tables
 
-# Initial frequencies of the fit, over the guess.
+# Initial frequencies of the fit relative to the guess.
 STARTS = np.linspace(0.5, 2.0, 61)
 # Relative tolerances of the fit.
 TIGHT = {"ftol": 1e-15, "xtol": 1e-15, "gtol": 1e-15}
 
 
 def problem(domain: Tables, time: tuple[float, int], fields: str, bodies: Sequence[Tables], **more: Any) -> Tables:
-    """Return the tables of a scene: `time` is the end and the number of frames, `fields` their names between blanks.
+    """Return the tables of a scene: `time` is the end, s, and the number of frames, `fields` names between spaces.
 
-    They are copies: scenes share the table of a material, and a caller may change the scene that it got.
+    The tables are copies, because cases share tables of materials and a caller may modify the scene.
     """
     end, frames = time
     parts = {"domain": domain, "time": {"end": end, "frames": frames}, "output": {"fields": fields.split()}}
@@ -58,7 +58,7 @@ def elastic(law: str, density: float, youngs_modulus: float, poissons_ratio: flo
 
 
 def lame_moduli(youngs_modulus: float, poissons_ratio: float) -> tuple[float, float]:
-    """Return mu and lambda: written here again, so that an error in the solver's does not cancel."""
+    """Return mu and lambda. Independent of the solver's code, so that an error there does not cancel."""
     E, nu = youngs_modulus, poissons_ratio
     return E / (2 * (1 + nu)), E * nu / ((1 + nu) * (1 - 2 * nu))
 
@@ -78,7 +78,7 @@ def shaft(n: int, height: float, gravity: float | str, across: int = 5, room: in
 def free_blocks(n: int, edge: float, count: int, gaps: Sequence[int]) -> tuple[Tables, list[Tables]]:
     """Return the domain and the shapes of blocks of n cells along an edge, one above the other along the last axis.
 
-    `gaps` are the empty cells beside the blocks along each axis, and between them along the last one.
+    `gaps` are the numbers of empty cells beside the blocks along each axis, and between them along the last one.
     """
     h, (*beside, between) = edge / n, gaps
     cells = [n + 2 * gap for gap in beside] + [count * (n + between) + between]
@@ -90,16 +90,16 @@ def free_blocks(n: int, edge: float, count: int, gaps: Sequence[int]) -> tuple[T
 def smooth_ramp(duration: float) -> str:
     """Return the text of an expression of t that rises from 0 to 1 within `duration`, s, and stays there.
 
-    s^4 (35 - 84 s + 70 s^2 - 20 s^3), s = t / duration: three derivatives vanish at both ends, so that a mode of
-    frequency w is left swinging with 1680 / (w duration)^4 of its static part at most (integrals by parts of the slope
-    140 s^3 (1 - s)^3, whose third derivative is 840 at both ends).
+    s^4 (35 - 84 s + 70 s^2 - 20 s^3), s = t / duration. Three derivatives vanish at both ends. The remaining
+    oscillation of a mode of frequency w is at most 1680 / (w duration)^4 of its static part (integration by parts of
+    the slope 140 s^3 (1 - s)^3, whose third derivative is 840 at both ends).
     """
     s = f"clamp(t / {duration!r}, 0, 1)"
     return f"({s} ** 4 * (35 - 84 * {s} + 70 * {s} ** 2 - 20 * {s} ** 3))"
 
 
 def reference_data(name: str) -> dict[str, Any]:
-    """Return a file of `data/`, which says where its figures come from."""
+    """Return the contents of a file of `data/`, which states its sources."""
     return tomllib.loads(files("mpmcli.validation").joinpath(f"data/{name}.toml").read_text(encoding="utf-8"))
 
 
@@ -109,12 +109,12 @@ def field(frame: Frame, name: str) -> np.ndarray:
 
 
 def damped_step(scene: Scene, step: float) -> float:
-    """Return the step, s, whose damping a lone body has at steps of `step`: its own where that is longer."""
+    """Return the step, s, that sets the damping of a single body: `step`, or the body's own step if longer."""
     return step * max(1.0, OWN_STEP / scene.time.safety)
 
 
 def in_middle(frame: Frame, scene: Scene, number: int, width: float) -> np.ndarray:
-    """Return which particles began in the middle of a body, a box or square of that width, m."""
+    """Return a mask of the particles of a body that start in its middle, a square or cube of `width`, m."""
     low, high = (np.array(bound) for bound in scene.bodies[number].shape.form.bounds())
     off = np.abs(field(frame, "initial_position") - (low + high) / 2).max(axis=1)
     return (frame.body == number) & (off < width / 2)
@@ -130,7 +130,7 @@ class Oscillation:
     offset: float
 
     def energy_loss(self) -> float:
-        """Return the part of the energy that is lost in a period."""
+        """Return the fraction of the energy that is lost per period."""
         return -math.expm1(-2 * self.decay * 2 * math.pi / self.frequency)
 
 
@@ -140,8 +140,8 @@ NOT_FOUND = Oscillation(math.nan, math.nan, math.nan, math.nan)
 def fit_oscillation(times: np.ndarray, signal: np.ndarray, frequency: float) -> Oscillation:
     """Fit a damped oscillation to several periods of a signal, (n,), by least squares.
 
-    The initial frequency, 0.5 to 2 times the guess in rad/s, is that of the best undamped fit. All is NaN if the fit
-    fails.
+    The initial frequency is that of the best undamped fit, 0.5 to 2 times the guess `frequency`, rad/s. All values are
+    NaN if the fit fails.
     """
     from scipy.optimize import least_squares
 
@@ -170,7 +170,7 @@ def fit_oscillation(times: np.ndarray, signal: np.ndarray, frequency: float) -> 
 
 
 def window_weights(count: int) -> np.ndarray:
-    """Return Hann's weights, (count,), of the frames of a window, first and last included; they sum to 1.
+    """Return the Hann weights, (count,), of the frames of a window, including first and last; they sum to 1.
 
     An oscillation with m periods in the window is reduced by sin(pi m) / (pi m (1 - m^2)): 0 for integers m > 1
     and less than 0.02 for m > 2.4. The factor of an unweighted mean is sin(pi m) / (pi m).
@@ -180,7 +180,7 @@ def window_weights(count: int) -> np.ndarray:
 
 
 def after_ramp(frames: Frames, ramp: int, window: int) -> Iterator[tuple[float, Frame]]:
-    """Yield the frames that follow the `ramp` first ones, `window` and one in number, each with its weight."""
+    """Yield the `window` + 1 frames from frame `ramp` on, each with its Hann weight."""
     weights = window_weights(window + 1)
     for frame, _ in frames:
         if frame.index >= ramp:

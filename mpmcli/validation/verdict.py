@@ -8,14 +8,14 @@ from mpmcli.validation.case import Case, Measure, Setting
 from mpmcli.validation.runs import Results, Run
 
 SINGLE = replace(Setting(), precision="f32")
-# Largest ratio of values in f32 to those in f64, where those are above rounding (`Measure.rounding`).
+# Largest admissible ratio of errors in f32 to those in f64, if above rounding (`Measure.rounding`).
 SINGLE_RATIO = 1.2
-# Errors below this are round-off of double precision, and have no order.
+# Errors below this are round-off in double precision and have no order.
 ROUND_OFF = 1e-10
 
 
 def observed_order(points: list[tuple[int, float]]) -> float | None:
-    """Return log(e1 / e2) / log(n2 / n1) of the last two of some pairs (n, error); None for one pair or round-off."""
+    """Return log(e1 / e2) / log(n2 / n1) of the last two pairs (n, error); None for fewer pairs or round-off."""
     if len(points) < 2 or not min(error for _, error in points[-2:]) > ROUND_OFF:
         return None
     (n1, e1), (n2, e2) = points[-2:]
@@ -23,16 +23,16 @@ def observed_order(points: list[tuple[int, float]]) -> float | None:
 
 
 def order_of(measure: Measure, results: Results) -> float | None:
-    """Return the order of a measure with the default setting, between the two finest resolutions that have one."""
+    """Return the order of a measure with the default setting, from the two finest resolutions up to `order_to`."""
     usual = [(run.n, result) for run, result in results.items() if run.setting == Setting() and result.finished]
     return observed_order([(n, result.error(measure.name)) for n, result in usual if n <= measure.order_to])
 
 
 @dataclass(frozen=True)
 class Check:
-    """The figure of a quantity and the bound that it must keep: the largest, or the smallest of an order.
+    """A checked value and its bound: an upper bound, or a lower bound of an order.
 
-    n is None for an order, figure and bound for a run that did not finish.
+    n is None for an order; figure and bound are None for a run that did not finish.
     """
 
     subject: str
@@ -69,7 +69,7 @@ class Verdict:
 def judge(case: Case, results: Results) -> Verdict:
     """Check the default setting against the bounds of the case, and f32 against f64. Other settings have no bounds.
 
-    Results are those of the case, each setting from coarse to fine.
+    `results` are those of the case, from coarse to fine in each setting.
     """
     checks = [check for run in results for check in _checks_of(case, run, results)]
     for measure in case.measures:
@@ -77,7 +77,7 @@ def judge(case: Case, results: Results) -> Verdict:
         if measure.order is not None and order is not None:
             passed, subject = order >= measure.order, f"order of {measure.name}"
             sentence = (
-                f"The {subject} is {order:.2f}, {'as' if passed else 'but'} at least {measure.order:g} is asked for."
+                f"The {subject} is {order:.2f}, {'as' if passed else 'but'} at least {measure.order:g} is required."
             )
             checks.append(Check(subject, Setting(), None, order, measure.order, passed, sentence))
     return Verdict(tuple(checks))

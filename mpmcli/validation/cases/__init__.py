@@ -22,7 +22,7 @@ def all_cases() -> dict[str, Case]:
 
 
 def _cases_of(module: ModuleType) -> Iterable[Case]:
-    """Return the cases of a module: those of its tuple CASES, or else one of each of its classes that have a name."""
+    """Return the cases of a module: its tuple CASES, or else an instance of each case class that has a name."""
     classes = [one for one in vars(module).values() if isinstance(one, type) and one.__module__ == module.__name__]
     named = [one for one in classes if issubclass(one, Case) and hasattr(one, "name")]
     return getattr(module, "CASES", None) or [one() for one in named]

@@ -1,6 +1,7 @@
-"""Vibrating bars: what the grid, and motion through it, do to the frequency and the energy of an axial wave.
+"""Vibrating bars: effects of the grid, and of motion through it, on the frequency and energy of an axial wave.
 
-Bardenhagen 2002 has the bars, von Neumann's analysis (docs/theory.md, 2.4 and 10) the errors of the scheme.
+The bars are those of Bardenhagen 2002; von Neumann analysis gives the errors of the scheme (docs/theory.md, 2.4 and
+10).
 """
 
 import math
@@ -16,11 +17,11 @@ WAVE_SPEED = math.sqrt(YOUNG / DENSITY)
 BAR = elastic("fixed_corotated", DENSITY, YOUNG, 0.0)
 # The grid has at least five cells per axis; the strip fills them, between slip walls, so that it stays one-dimensional.
 STRIP = 5
-# With this many frames, just under two steps of 0.8 of the limit fit between two of the coarsest bar, just under four
-# of the next: steps are at most slightly smaller than those of the setting.
+# The interval of frames is just under two steps of 0.8 of the limit for the coarsest bar, and just under four for the
+# next, so that steps are at most slightly smaller than those of the setting.
 PERIODS, FRAMES_PER_PERIOD = 5, 17
 FRAMES = PERIODS * FRAMES_PER_PERIOD
-# Loss at a free end, over that of the wave: 5.8 / n, from 13, 26 and 52 cells.
+# Ratio of the loss at a free end to that of the wave, times n; measured with 13, 26 and 52 cells.
 END_LOSS = 5.8
 # Offsets of cells within the support of a quadratic B-spline.
 NEIGHBOURS = range(-3, 4)
@@ -29,14 +30,14 @@ NEIGHBOURS = range(-3, 4)
 def discrete_wave(kh: float, courant: float, per_axis: int) -> tuple[float, float]:
     """Return the errors of MLS-MPM with APIC, quadratic B-splines and leapfrog for a wave e^(i(kx - wt)) along an axis.
 
-    They are its period over the exact one, minus 1, and the part of its energy lost in a step. `kh` is the wave number
-    times the spacing, `courant` is c dt / h, and each cell has `per_axis` particles, evenly spaced. Each particle of a
-    cell has the amplitudes v, C and the strain e, in units of h and c: the nodes take
-    sum_p w (v + (x_i - x_p)(C - 4 C_0 e)) / sum_p w with the Courant number C_0, the particles gather v and C from
-    them, and e grows by C_0 C. The matrix of that step has an eigenvalue next to e^(i kh C_0): its angle is the
-    frequency, its square the energy that is left.
-    The loss does not depend on the step: with very many particles it is (kh)^4 / 42 for small kh, with 2 to 4 per axis
-    0.0238 to 0.0242 (kh)^4.
+    They are its period over the exact one, minus 1, and the fraction of its energy lost in a step. `kh` is the wave
+    number times the spacing, `courant` is c dt / h, and each cell has `per_axis` evenly spaced particles. Each particle
+    of a cell has the amplitudes v, C and the strain e, in units of h and c. The nodal velocity is
+    sum_p w (v + (x_i - x_p)(C - 4 C_0 e)) / sum_p w with the Courant number C_0; the particles gather v and C from the
+    nodes, and e increases by C_0 C. The matrix of this step has an eigenvalue near e^(i kh C_0): its angle gives the
+    frequency, the square of its modulus the remaining energy.
+    The loss does not depend on the step: it is (kh)^4 / 42 for small kh with very many particles, and 0.0238 to
+    0.0242 (kh)^4 with 2 to 4 per axis.
     """
     scatter = np.zeros(3 * per_axis, complex)
     gather = np.zeros((3 * per_axis, 1), complex)
@@ -46,7 +47,7 @@ def discrete_wave(kh: float, courant: float, per_axis: int) -> tuple[float, floa
         v, C, e = 3 * p, 3 * p + 1, 3 * p + 2
         kept[e, e] = 1.0
         for j in NEIGHBOURS:
-            # The particle of cell j at the node at 0, and the node at j at the particle of cell 0.
+            # P2G from the particle of cell j to node 0, then G2P from node j to the particle of cell 0.
             w, away, phase = _weight(x + j), -(x + j), np.exp(1j * kh * j)
             mass += w
             scatter[v] += w * phase
@@ -77,22 +78,22 @@ class Bar(Case):
     levels = {"coarse": (13, 26), "default": (13, 26, 52), "fine": (13, 26, 52, 104)}  # noqa: RUF012
 
     def __init__(self, name: str, title: str, quarters: int, room: int) -> None:
-        """`quarters`: quarter waves in the bar; `room`: empty cells beyond a free end."""
+        """`quarters` is the number of quarter waves in the bar, `room` that of empty cells beyond a free end."""
         self.name, self.title, self.room = name, title, room
         self.b = b = quarters * math.pi / (2 * LENGTH)
         self.frequency = b * WAVE_SPEED
         free = room > 0
-        # What the other knobs do shows in the bar between two walls.
+        # The bar between two walls covers the other settings.
         self.varies = ("precision",) if free else Case.varies
         self.measures = (
             self.text.measure("period error", lambda n: 1.3 * 0.105 * (b * LENGTH / n) ** 2, order=1.9, expected=2.0),
-            # Between walls: what a fit to a signal of finite amplitude cannot tell.
+            # Between walls: limit of the fit to a signal of finite amplitude.
             self.text.measure(
                 "period error against theory",
                 (lambda n: 0.3 / n) if free else (lambda n: 2.8e-6 * (n / 13) ** 1.4),
                 rounding=0.008,
             ),
-            # Where the loss itself, which falls as n^-3 in a period, is above what a finite amplitude does to it; the
+            # Bounded where the loss, which falls as n^-3 in a period, is above the effect of the finite amplitude; the
             # rounding is that of a loss of 1e-5 and less.
             self.text.measure(
                 "dissipation against theory",
@@ -138,18 +139,18 @@ class Bar(Case):
         }
 
 
-# The rods, one of which flies: the speed of the vibration, and ten times that along the rod, so that by the end it has
-# flown its own length.
+# The rods: speed of the vibration, and velocity of the flying rod, ten times that along the rod, which travels its own
+# length until the end.
 ROD_SPEED = 0.1
 FLIGHT = (10 * ROD_SPEED, 3 * ROD_SPEED)
 B = math.pi / LENGTH
 FREQUENCY = B * WAVE_SPEED
-# Height of a rod, room around it and between the two, cells; and where in a cell the flying one starts.
+# Height of a rod and gaps around and between the rods, cells; initial offset of the flying rod within a cell.
 HEIGHT, ROOM, OFFSET = 4, 4, (0.37, 0.23)
 
 
 class Galilean(Case):
-    """u = v0/w sin(w t) cos(b X) in two free rods, of which one flies with ten times the speed of the vibration."""
+    """u = v0/w sin(w t) cos(b X) in two free rods, one of which flies at ten times the speed of the vibration."""
 
     text = case_text("galilean")
     name, title, group = "galilean", "Vibrating rod in flight and at rest", "invariants"
@@ -187,7 +188,7 @@ class Galilean(Case):
                 mine = frame.body == rod
                 X = field(frame, "initial_position")[mine, 0]
                 shape = np.cos(B * (X - scene.bodies[rod].shape.form.bounds()[0][0]))
-                # A uniform motion has no part in this sum: the shape is odd about the middle of the rod.
+                # Uniform motion does not contribute to this sum: the shape is odd about the middle of the rod.
                 signal.append(float((frame.position[mine, 0] - X) @ (shape - shape.mean())))
         rest, flying = (fit_oscillation(np.array(times), np.array(signal), FREQUENCY) for signal in signals)
         at_rest, in_flight = (FREQUENCY / wave.frequency - 1 for wave in (rest, flying))

@@ -1,4 +1,4 @@
-"""Clamped beams with a load at the tip: a small and a large deflection, against Reissner's beam and the elastica."""
+"""Clamped beams with a load at the tip: small and large deflections, against Reissner's beam and the elastica."""
 
 import math
 from dataclasses import dataclass
@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 class Beam:
     """A beam of length 1 and bending stiffness EI = 1, straight along x and clamped at 0, with a load along y.
 
-    The load, P L^2 / EI, is spread over a part of the length, at the free end. The axial stiffness, EA L^2 / EI, and
-    that in shear, k G A L^2 / EI, are infinite for the elastica.
+    The load, P L^2 / EI, is spread over the last fraction `spread` of the length. The axial stiffness, EA L^2 / EI, and
+    the shear stiffness, k G A L^2 / EI, are infinite for the elastica.
     """
 
     load: float
@@ -28,11 +28,11 @@ class Beam:
     shear: float = math.inf
 
     def bent(self) -> "OdeSolution":
-        """Return the centre line in equilibrium: a function of places from 0 to 1 that gives x, y, theta and M there.
+        """Return the centre line in equilibrium: a function of s from 0 to 1 that gives x, y, theta and M.
 
         theta' = M, M' = -x' f, (x, y)' = (1 + N/EA) (cos, sin) theta + V/kGA (-sin, cos) theta with N = f sin theta,
-        V = f cos theta, and f the part of the load that acts beyond s (Reissner 1972). M at the clamp is sought at
-        which the tip has none, below that of an elastica, for which M^2 / 2 + load sin theta is constant.
+        V = f cos theta, and f the part of the load that acts beyond s (Reissner 1972). M at the clamp is the root of
+        M(1) = 0. Its upper bound follows from the elastica, for which M^2 / 2 + load sin theta is constant.
         """
         from scipy.optimize import brentq
 
@@ -58,24 +58,24 @@ class Beam:
 
 LENGTH, THICKNESS, YOUNG, DENSITY = 5.0, 1.0, 1e6, 1000.0
 SLENDERNESS = LENGTH / THICKNESS
-# The part of the length, at the tip, that carries the load.
+# Fraction of the length, at the tip, that carries the load.
 SPREAD = 0.1
-# The first period while the beam is straight, s: 2 pi / 3.516 sqrt(density A L^4 / EI).
+# First period of the straight beam, s: 2 pi / 3.516 sqrt(density A L^4 / EI).
 PERIOD = 2 * math.pi / 3.516 * LENGTH * SLENDERNESS * math.sqrt(12 * DENSITY / YOUNG)
-# In first periods: how long the load takes to come on, and how long the mean is taken after that.
+# In first periods: the ramp of the load, and the averaging window after it.
 RAMP, WINDOW, FRAMES_PER_PERIOD = 3, 2, 24
 # Extent of the domain beyond the beam, m; the beam lies from 0 to its thickness, and its tip sinks by 1.5 m.
 RIGHT, BELOW, ABOVE = 1.0, 3.0, 1.0
-TIP = "Distance of the tip from where Reissner's beam has it, over its displacement."
-THIN = Measure("deflection against thin: Deflection of the tip over that of a beam without shear and stretch, less 1.")
+TIP = "Distance of the tip from that of Reissner's beam, over its displacement."
+THIN = Measure("deflection against thin: Deflection of the tip over that of a beam without shear and stretch, minus 1.")
 
 
 class Cantilever(Case):
-    """EI theta'' = -P cos theta along the line of a thin beam; Reissner's beam has shear and stretch besides.
+    """EI theta'' = -P cos theta along the line of a thin beam; Reissner's beam adds shear and stretch.
 
-    P comes on smoothly within three periods of the beam, along y for good, and what is measured are means over two
-    periods after that. With nu = 0 fixed corotated bends linearly, M = EI kappa at any kappa. The wall sticks, which
-    holds all of the end face.
+    P rises smoothly within three periods of the beam and stays along y; the measures are means over the two periods
+    after that. With nu = 0 fixed corotated bends linearly, M = EI kappa at any kappa. The wall sticks and so holds the
+    whole end face.
     """
 
     group = "solids"
@@ -113,7 +113,7 @@ class Cantilever(Case):
             last = along > along.max() - scene.domain.spacing / 100
             tip += weight * frame.position[last].astype(np.float64).mean(axis=0)
         place = float(along.max()) / LENGTH
-        # Down from the middle of the beam, over the length.
+        # Along x and down from the middle of the beam, over the length.
         moved = np.array([tip[0], THICKNESS / 2 - tip[1]]) / LENGTH
         exact = self.beam().bent()(place)[:2]
         return {
@@ -123,7 +123,7 @@ class Cantilever(Case):
 
 
 class SmallBend(Cantilever):
-    """The tip sinks by 0.03 m, a quarter of the finest cells: particles keep their places in their cells."""
+    """The tip sinks by 0.03 m, a quarter of the finest cells: particles hardly move relative to the cells."""
 
     text = case_text("cantilever_small")
     name, title = "cantilever_small", "Cantilever that hardly bends"
@@ -134,7 +134,7 @@ class SmallBend(Cantilever):
 
 
 class LargeBend(Cantilever):
-    """The tip sinks by three tenths of the length, where a linear beam would sink by a third."""
+    """The tip sinks by three tenths of the length; that of a linear beam would sink by a third."""
 
     text = case_text("cantilever")
     name, title = "cantilever", "Cantilever that bends far: the elastica"
@@ -146,7 +146,7 @@ class LargeBend(Cantilever):
 
 
 class TotalBend(LargeBend):
-    """The same on the grid of the state at rest, with the particles that a scene has by default."""
+    """The same as a total Lagrangian solid, with the default number of particles."""
 
     text = case_text("cantilever_total")
     name, title = "cantilever_total", "Cantilever that bends far, total Lagrangian"

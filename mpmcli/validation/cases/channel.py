@@ -1,4 +1,4 @@
-"""Flow between two walls that stick, started by a pull or by one of the walls, of a viscous and of a Bingham fluid."""
+"""Flow of a viscous and a Bingham fluid between sticking walls, driven by a body force or by a moving wall."""
 
 import math
 from collections.abc import Callable
@@ -9,22 +9,23 @@ from mpmcli.scene import Scene
 from mpmcli.validation.case import Case, Frames, Measure, Tables, case_text
 from mpmcli.validation.shared import body, box, field, fluid, problem
 
-# Distance of the walls, m; density, kg/m^3; kinematic viscosity, m^2/s; the pull, m/s^2; and the speed of a wall, m/s.
+# Distance of the walls, m; density, kg/m^3; kinematic viscosity, m^2/s; acceleration by the body force, m/s^2; and
+# speed of the moving wall, m/s.
 WIDTH, DENSITY, VISCOSITY, PULL, SPEED = 1.0, 1000.0, 1.0, 0.5, 0.5
-# Sound crosses ten channels in the time in which viscosity crosses one.
+# Sound travels ten widths in the viscous time, WIDTH^2 / VISCOSITY.
 VISCOUS = fluid(DENSITY, DENSITY * (10 * VISCOSITY / WIDTH) ** 2, viscosity=DENSITY * VISCOSITY, tension_cutoff=False)
-# Length of the middle that is looked at, in widths.
+# Length of the evaluated middle, in widths.
 MIDDLE = 1
-# Width of the plug of the Bingham fluid, in that of the channel.
+# Width of the plug of the Bingham fluid, relative to that of the channel.
 PLUG = 0.4
-# Terms of the series; the first one left out has 1e-6 of the first.
+# Terms of the series; the first omitted term is 1e-6 of the first.
 TERMS = 50
-# Cells along the channel whose faces are periodic: nothing depends on the place along it.
+# Cells along the channel with periodic ends: the flow does not depend on the position along it.
 PERIODIC = 8
 
 
 def started(y: np.ndarray, time: float) -> np.ndarray:
-    """Return the velocity of a viscous fluid at y, m/s, a time after a pull began, s.
+    """Return the velocity of a viscous fluid at y, m/s, at a time after the body force starts, s.
 
     u = g/(2 nu) y (W - y) - sum 4 g W^2/(nu (k pi)^3) sin(k pi y/W) exp(-nu (k pi/W)^2 t) over odd k.
     """
@@ -34,7 +35,7 @@ def started(y: np.ndarray, time: float) -> np.ndarray:
 
 
 def dragged(y: np.ndarray, time: float) -> np.ndarray:
-    """Return the velocity of a viscous fluid at y, m/s, a time after the upper wall began to move, s.
+    """Return the velocity of a viscous fluid at y, m/s, at a time after the upper wall starts to move, s.
 
     u = U y/W + sum 2 U/(n pi) (-1)^n sin(n pi y/W) exp(-nu (n pi/W)^2 t).
     """
@@ -44,7 +45,7 @@ def dragged(y: np.ndarray, time: float) -> np.ndarray:
 
 
 def plugged(y: np.ndarray, plug: float) -> np.ndarray:
-    """Return the steady velocity of a Bingham fluid at y, m/s, whose plug has a width in that of the channel.
+    """Return the steady velocity of a Bingham fluid at y, m/s; `plug` is the width of its plug over the channel's.
 
     u = g/(2 nu) ((W/2 - b)^2 - max(|y - W/2| - b, 0)^2) with the half width b of the plug, yield stress = density g b.
     """
@@ -53,15 +54,15 @@ def plugged(y: np.ndarray, plug: float) -> np.ndarray:
 
 
 class Channel(Case):
-    """A strip of fluid, its ends free and far away, that is pulled along the channel from rest."""
+    """A strip of fluid with free, distant ends that is accelerated along the channel from rest."""
 
     resolution = "cells across the channel"
-    # End of the run, s, and length of the strip in widths: what its ends do has not come to the middle by then.
+    # End of the run, s, and length of the strip in widths: its ends do not affect the middle until then.
     end: float
     length: int
     material: Tables
 
-    # The velocity along the channel at y, m, and at a time, s, in m/s.
+    # The exact velocity along the channel, m/s, at y, m, and a time, s.
     known: Callable[[np.ndarray, float], np.ndarray]
 
     def tables(self, n: int) -> Tables:
@@ -75,7 +76,7 @@ class Channel(Case):
             },
             (self.end, 1),
             "velocity initial_position",
-            # Rows along the channel stay rows: any other sample has a noise across it.
+            # Particles stay in rows along the channel; any other sampling causes noise across it.
             [body("fluid", self.material, box([4 * h, 0.0], [4 * h + self.length * WIDTH, WIDTH]), sampling="lattice")],
         )
 
@@ -84,7 +85,7 @@ class Channel(Case):
         X = field(last, "initial_position")
         start, end = (bound[0] for bound in scene.bodies[0].shape.form.bounds())
         middle = np.abs(X[:, 0] - (start + end) / 2) < MIDDLE * WIDTH / 2
-        # Velocities are half a step old.
+        # Velocities lag positions by half a step.
         exact = self.known(X[middle, 1], last.time - row.step_max / 2)
         u, v = last.velocity[middle].astype(np.float64).T
         return {
@@ -95,17 +96,17 @@ class Channel(Case):
 
 
 def channel_measures(bound: Callable[[int], float], order: float | None = None) -> tuple[Measure, ...]:
-    """Return the measures with bounds of that of the velocity; the flow is a mean of it."""
+    """Return the measures; the flow, a mean of the velocity, has the bound of the velocity."""
     text = "L2 error of the velocity in the middle, over the velocity."
     return (
         Measure(f"velocity error: {text}", bound, order=order, expected=2.0),
-        Measure("flow error: Flow through the middle over the exact one, less 1.", bound, expected=2.0),
+        Measure("flow error: Flow through the middle over the exact one, minus 1.", bound, expected=2.0),
         Measure("cross flow: Largest velocity across the channel, over the largest along it.", 1e-4),
     )
 
 
 class Poiseuille(Channel):
-    """The plane flow of Poiseuille, a fifth of the time after its start in which viscosity crosses the channel."""
+    """Plane Poiseuille flow at 0.15 WIDTH^2 / VISCOSITY after its start."""
 
     text = case_text("poiseuille")
     name, title, group = "poiseuille", "Start of a viscous flow between walls that stick", "fluids"
@@ -125,7 +126,7 @@ class Bingham(Channel):
     levels = {"coarse": (16,), "default": (16, 32), "fine": (16, 32, 64)}  # noqa: RUF012
     end, length = 0.55 * WIDTH**2 / VISCOSITY, 20
     varies = ("precision",)
-    # Shear waves cross twelve channels in the time in which viscosity crosses one.
+    # Shear waves travel twelve widths in the viscous time.
     modulus = DENSITY * (12 * VISCOSITY / WIDTH) ** 2
     flow = {"yield_stress": DENSITY * PULL * PLUG * WIDTH / 2, "consistency": DENSITY * VISCOSITY}  # noqa: RUF012
     material = fluid(DENSITY, modulus, shear_modulus=modulus, law="viscoplastic", **flow)
@@ -134,7 +135,7 @@ class Bingham(Channel):
 
 
 class Couette(Case):
-    """The plane flow of Couette, a tenth of the time after its start in which viscosity crosses the channel."""
+    """Plane Couette flow at 0.1 WIDTH^2 / VISCOSITY after its start."""
 
     text = case_text("couette")
     name, title, group = "couette", "Start of a viscous flow by a wall that moves", "fluids"
@@ -166,7 +167,7 @@ class Couette(Case):
         *_, (last, row) = frames
         y = field(last, "initial_position")[:, 1]
         u, v = last.velocity.astype(np.float64).T
-        # Velocities are half a step old.
+        # Velocities lag positions by half a step.
         exact = dragged(y, last.time - row.step_max / 2)
         return {
             "velocity error": float(np.sqrt(((u - exact) ** 2).mean())) / SPEED,

@@ -1,4 +1,4 @@
-"""A column on which gravity is switched on at once: it swings to twice its settlement and back (d'Alembert)."""
+"""A column with gravity switched on at t = 0: it oscillates between zero and twice its settlement (d'Alembert)."""
 
 import math
 
@@ -12,18 +12,18 @@ HEIGHT, YOUNG, DENSITY, GRAVITY = 1.0, 1e6, 1000.0, 1.0
 WAVE_SPEED = math.sqrt(YOUNG / DENSITY)
 PERIOD = 4 * HEIGHT / WAVE_SPEED
 WEIGHT = DENSITY * GRAVITY * HEIGHT
-# The top sinks by twice its settlement, m.
+# Largest settlement of the top, twice the static one, m.
 PEAK = WEIGHT * HEIGHT / YOUNG
 PERIODS, FRAMES_PER_PERIOD = 3, 48
-# What sums over particles that are no longer evenly spread, by strains of 1e-3, leave of the error at any spacing.
+# Quadrature error at any spacing: at strains of 1e-3 particles are no longer evenly spaced.
 FLOOR = 4e-5
 
 
 def exact_stress(Y: np.ndarray, time: float) -> np.ndarray:
     """Return sigma_yy at height Y, m, Pa, for small strain.
 
-    What is missing to the state of rest, S = -density g (height - |Y|), goes out as two waves, even about the base and
-    odd about the top: sigma = S(Y) - (S(Y - ct) + S(Y + ct)) / 2.
+    The difference from the state of rest, S = -density g (height - |Y|), propagates as two waves, even about the base
+    and odd about the top: sigma = S(Y) - (S(Y - ct) + S(Y + ct)) / 2.
     """
 
     def at_rest(y: np.ndarray) -> np.ndarray:
@@ -35,7 +35,7 @@ def exact_stress(Y: np.ndarray, time: float) -> np.ndarray:
 
 
 def extreme(times: np.ndarray, values: np.ndarray) -> float:
-    """Return the value of the largest sample and its neighbours where the parabola through them peaks."""
+    """Return the peak of the parabola through the largest sample and its neighbours."""
     k = int(np.clip(values.argmax(), 1, len(values) - 2))
     left, middle, right = values[k - 1 : k + 2]
     bend = left - 2 * middle + right

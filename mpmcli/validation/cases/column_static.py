@@ -1,4 +1,4 @@
-"""A column that settles under its own weight, brought on slowly: the stress is known for any law."""
+"""A column that settles under its own weight, applied slowly: the stress is known for any law."""
 
 import math
 
@@ -12,14 +12,14 @@ HEIGHT, DENSITY, GRAVITY = 50.0, 80.0, 10.0
 WEIGHT = DENSITY * GRAVITY
 # Strain at the base: 0.4 % in the firm column, 4 % in the soft one.
 FIRM, SOFT = 1e7, 1e6
-# In first periods of the column: how long the load takes to come on, and how long the mean is taken after that.
+# In first periods of the column: the ramp of the load, and the averaging window after it.
 RAMP, WINDOW, FRAMES_PER_PERIOD = 10, 2, 24
 
 
 def stretch(law: str, youngs_modulus: float, Y: np.ndarray) -> np.ndarray:
-    """Return F_yy where the column began at height Y, m: the root of P(F) = -density g (height - Y).
+    """Return F_yy at the initial height Y, m: the root of P(F) = -density g (height - Y).
 
-    With nu = 0 there is no stress but along y. neo_hookean: P = E/2 (F - 1/F); fixed_corotated: P = E (F - 1);
+    With nu = 0 the only stress is along y. neo_hookean: P = E/2 (F - 1/F); fixed_corotated: P = E (F - 1);
     von_mises below its yield stress, Hencky's law: P = E ln F / F.
     """
     a = WEIGHT * (HEIGHT - Y) / youngs_modulus
@@ -34,14 +34,14 @@ def stretch(law: str, youngs_modulus: float, Y: np.ndarray) -> np.ndarray:
 
 
 def rest_place(law: str, youngs_modulus: float, Y: np.ndarray) -> np.ndarray:
-    """Return where matter from height Y comes to rest, m: the integral of F_yy from 0 to Y, by Gauss's rule."""
+    """Return the height at rest of material from height Y, m: the integral of F_yy from 0 to Y, by Gauss quadrature."""
     nodes, weights = np.polynomial.legendre.leggauss(20)
     half = Y[..., None] / 2
     return (stretch(law, youngs_modulus, half * (1 + nodes)) * half) @ weights
 
 
 class WeightedColumn(Case):
-    """sigma_yy = -density g (height - Y), Y the height at the start, in a column between rollers with nu = 0.
+    """sigma_yy = -density g (height - Y), Y the initial height, in a column between rollers with nu = 0.
 
     Gravity rises smoothly within ten periods of the column; the measures are means over the two periods after that.
     """
@@ -81,7 +81,7 @@ SETTLEMENT = "Largest error of the height of a particle, over the settlement of 
 
 
 class ColumnStatic(WeightedColumn):
-    """The firm column: strains of 0.4 %, so that particles keep their places in their cells."""
+    """The firm column: at strains of 0.4 % particles hardly move relative to the cells."""
 
     text = case_text("column_static")
     name, title = "column_static", "Column at rest under its own weight"
@@ -98,11 +98,11 @@ class ColumnStatic(WeightedColumn):
 
 
 class ColumnSettlement(WeightedColumn):
-    """The soft column: strains of 4 %, at which each law settles by a length of its own."""
+    """The soft column: at strains of 4 % the settlement depends on the law."""
 
     text = case_text("column_settlement")
     youngs_modulus = SOFT
-    # What the knobs do shows in the firm column.
+    # The firm column covers the other settings.
     varies = ("precision",)
     levels = {"coarse": (32,), "default": (16, 32, 64), "fine": (16, 32, 64, 128)}  # noqa: RUF012
     measures = (
@@ -118,6 +118,6 @@ CASES = (
     ColumnStatic(),
     ColumnSettlement("column_neo_hookean", "Settlement of a neo-Hookean column", "neo_hookean"),
     ColumnSettlement("column_corotated", "Settlement of a fixed corotated column", "fixed_corotated"),
-    # So strong that it never yields.
+    # Strong enough never to yield.
     ColumnSettlement("column_hencky", "Settlement of a column of Hencky's law", "von_mises", yield_stress=1e9),
 )

@@ -1,4 +1,4 @@
-"""Free bodies that spin and ring: momenta and energy over thousands of steps (docs/theory.md, 10)."""
+"""Free bodies that rotate and vibrate: momenta and energy over thousands of steps (docs/theory.md, 10)."""
 
 import math
 
@@ -11,13 +11,13 @@ from mpmcli.validation.shared import ball, body, box, elastic, field, problem
 FRAMES = 200
 DENSITY, YOUNG, POISSON = 1000.0, 1e4, 0.3
 EDGE, RADIUS = 0.5, 0.3
-# Spin and strain rate at the start, 1/s: the strain reaches a few per cent, and bodies turn by some turns.
+# Initial spin and strain rate, 1/s: the strain reaches a few per cent, and bodies make several turns.
 SPIN, RATE = 1.5, 0.5
 DRIFT = (0.004, -0.003, 0.002)
 
 
 def started(turn: float, rate: float, dimension: int) -> list[list[float]]:
-    """Return the velocity gradient of a start that spins about every axis and stretches along x, 1/s."""
+    """Return an initial velocity gradient, 1/s: rotation about every axis and stretching along x."""
     L = [[0.0] * dimension for _ in range(dimension)]
     for i in range(dimension):
         for j in range(i):
@@ -37,7 +37,7 @@ class Conservation(Case):
 
     def __init__(self, name: str, title: str, dimension: int, levels: Levels) -> None:
         self.name, self.title, self.dimension, self.levels = name, title, dimension, levels
-        # Of the waves in the bodies, the shorter ones go first.
+        # Shorter waves in the bodies are damped first.
         loss = (lambda n: 0.2 * (8 / n) ** 0.45) if dimension == 2 else 0.11
         self.measures = (
             self.text.measure("angular momentum drift", 2e-14),
@@ -46,7 +46,7 @@ class Conservation(Case):
             self.text.measure("energy gain", 5e-4),
             self.text.measure("energy loss", loss),
         )
-        # Some thousand steps.
+        # Several thousand steps.
         self.end = 20.0 if dimension == 2 else 10.0
         volume = math.pi * RADIUS**2 if dimension == 2 else 4 / 3 * math.pi * RADIUS**3
         self.mass = DENSITY * (EDGE**dimension + volume)
@@ -92,7 +92,7 @@ class Conservation(Case):
 
 
 class Meeting(Conservation):
-    """A soft ball that spins, and one a hundred times stiffer, which meet off centre: their steps are not the same."""
+    """Off-centre collision of a rotating soft ball and one a hundred times stiffer, with different stable steps."""
 
     text = case_text("conservation_contact")
     varies = ("precision", "transfer", "safety")

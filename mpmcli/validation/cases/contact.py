@@ -1,4 +1,4 @@
-"""Blocks on walls and on each other: one that takes off, and those that slide or roll by Coulomb's law."""
+"""Bodies on walls and on each other: lift-off, and sliding and rolling with Coulomb friction."""
 
 import math
 
@@ -9,7 +9,7 @@ from mpmcli.validation.case import Case, Frames, Measure, Tables, case_text
 from mpmcli.validation.shared import ball, body, box, elastic, problem, smooth_ramp
 
 GRAVITY, DENSITY, YOUNG = 9.81, 1000.0, 1e6
-# The block that slides along a floor, m, its friction, and its speed, m/s.
+# The sliding block: length and height, m, coefficient of friction, and initial speed, m/s.
 LENGTH, HEIGHT, FRICTION, SPEED = 1.0, 0.25, 0.3, 2.0
 DECELERATION = FRICTION * GRAVITY
 STOP = SPEED / DECELERATION
@@ -23,15 +23,15 @@ class SlidingBlock(Case):
     levels = {"coarse": (4,), "default": (4, 8), "fine": (4, 8, 16)}  # noqa: RUF012
     varies = ("precision", "kernel", "transfer")
     measures = (
-        Measure("distance error: How far it slides, relative to v0^2 / (2 mu g).", 7e-3),
-        Measure("deceleration error: While it slides, relative to mu g.", 7e-3),
-        Measure("drift (L/s): Speed of what has come to rest, in lengths per second.", 8e-5),
+        Measure("distance error: Error of the sliding distance, relative to v0^2 / (2 mu g).", 7e-3),
+        Measure("deceleration error: Error of the deceleration while sliding, relative to mu g.", 7e-3),
+        Measure("drift (L/s): Speed after the block has stopped, in lengths per second.", 8e-5),
     )
 
     def tables(self, n: int) -> Tables:
         block = body(
             "block",
-            # With nu = 0 the weight makes one-dimensional compression, in which the block begins.
+            # With nu = 0 the weight causes one-dimensional compression, which is the initial state.
             elastic("neo_hookean", DENSITY, YOUNG, 0.0),
             box([2 * HEIGHT, 0.0], [2 * HEIGHT + LENGTH, HEIGHT]),
             velocity=[SPEED, 0.0],
@@ -53,28 +53,28 @@ class SlidingBlock(Case):
         }
 
 
-# Of the bodies with velocity fields of their own.
+# Material of the bodies with separate velocity fields.
 SOLID = elastic("neo_hookean", DENSITY, 4e6, 0.3)
-# The weight comes on, then what pulls along the slope, then rates are measured, s.
+# End of the ramp of the normal load and start of the load along the slope, start of the measurement, and end, s.
 LOADED, MEASURED, END = 0.2, 0.25, 0.6
 FRAMES = 60
 
 
 def pull(degrees: float, along: np.ndarray, up: np.ndarray) -> list[str]:
-    """Return gravity at an angle to a slope, with unit vectors along and normal to it: its normal part comes first."""
+    """Return the gravity of a slope, given unit vectors along and normal to it; its normal part is applied first."""
     slope, step = math.radians(degrees), f"clamp((t - {LOADED}) * 1e6, 0, 1)"
     parts = GRAVITY * math.sin(slope) * along, -GRAVITY * math.cos(slope) * up
     return [f"{one!r} * {step} + {other!r} * ({smooth_ramp(LOADED)})" for one, other in np.array(parts).T.tolist()]
 
 
 def rate(times: list[float], values: list[float]) -> float:
-    """Return the slope of values after MEASURED."""
+    """Return the rate of change of values after MEASURED."""
     late = np.array(times) > MEASURED
     return float(np.polyfit(np.array(times)[late], np.array(values)[late], 1)[0])
 
 
 class SlopeContact(Case):
-    """A block on an elastic base, with gravity at 30 degrees, 0.3 cells off the grid."""
+    """A block on an elastic base with a slope of 30 degrees, 0.3 cells off the grid."""
 
     text = case_text("slope_contact")
     name, title, group = "slope_contact", "Block that slides on an elastic base", "solids"
@@ -115,7 +115,7 @@ class SlopeContact(Case):
 
 
 class RollingContact(SlopeContact):
-    """A disk on a rough plane that is turned by 17 degrees on the grid, with gravity at 20 degrees to it."""
+    """A disk on a rough plane at 17 degrees to the grid, with a slope of 20 degrees."""
 
     text = case_text("rolling_contact")
     name, title = "rolling_contact", "Disk that rolls on a rough plane"
@@ -140,7 +140,7 @@ class RollingContact(SlopeContact):
         return problem(domain, (END, FRAMES), "velocity", [disk], **more)
 
     def axes(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return unit vectors down the plane and out of it."""
+        """Return unit vectors down the plane and normal to it."""
         c, s = math.cos(self.turned), math.sin(self.turned)
         return np.array([c, -s]), np.array([s, c])
 
@@ -153,12 +153,12 @@ class RollingContact(SlopeContact):
         }
 
 
-# The block that takes off: its edge, m, and velocity, m/s.
+# The block that lifts off: its edge, m, and velocity, m/s.
 EDGE, VELOCITY = 1.0, (1.5, 4.0)
 
 
 class TakeOff(Case):
-    """x = X + v t - g t^2/2 from the first step on: walls that let go do not pull."""
+    """x = X + v t - g t^2/2 from the first step on: separating walls do not pull."""
 
     text = case_text("take_off")
     name, title, group = "take_off", "Block that takes off from separating walls", "invariants"
@@ -173,7 +173,7 @@ class TakeOff(Case):
         material = elastic("neo_hookean", DENSITY, YOUNG, 0.3)
         block = body("block", material, box([0.0, 0.0], [EDGE, EDGE]), velocity=[*VELOCITY])
         domain = {"size": [3 * EDGE] * 2, "cells": [3 * n] * 2, "gravity": [0.0, -GRAVITY], "walls": "separate"}
-        # It does not come down again until then.
+        # The block is still in the air at the end.
         return problem(domain, (0.5, 10), "stress initial_position", [block])
 
     def measure(self, n: int, scene: Scene, frames: Frames) -> dict[str, float]:

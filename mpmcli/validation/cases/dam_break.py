@@ -1,4 +1,4 @@
-"""Dam breaks beside measured ones: columns (Martin and Moyce 1952), and an obstacle (Kleefsman et al. 2005)."""
+"""Dam breaks against experiments: columns (Martin and Moyce 1952), and an obstacle (Kleefsman et al. 2005)."""
 
 import math
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from mpmcli.scene import Scene
 from mpmcli.validation.case import Case, Frames, Tables, case_text
 from mpmcli.validation.shared import body, box, fluid, problem, reference_data
 
-# Range of T that is compared. Earlier the column is nearly at rest; later friction slows the thin front.
+# Compared range of T. Earlier the column is nearly at rest; later friction slows the thin front.
 FIRST, LAST = 1.0, 4.0
 # Height over width of the columns.
 N_SQUARED = 2.0
@@ -21,9 +21,9 @@ SHIFTS = np.linspace(0.0, 0.6, 121)
 # a of the larger column, m.
 COLUMN = 0.05715
 GRAVITY, DENSITY = 9.81, 1000.0
-# The front is where all but this share of the water is behind: what is left are drops and a film.
+# Fraction of the water ahead of the front, which consists of drops and a film.
 FILM = 0.001
-# The height at the back is that of the highest water within this part of the width.
+# The height at the back is that of the highest water within this fraction of the width.
 BACK = 1 / 8
 
 
@@ -48,7 +48,7 @@ def measured(quantity: Literal["front", "height"]) -> tuple[Series, ...]:
 
 
 def mean_error(series: Series, T: np.ndarray, value: np.ndarray, shift: float = 0.0) -> float:
-    """Return the mean of |value - measured| / measured of a curve to T = LAST, for a gate that opens `shift` late."""
+    """Return the mean of |value - measured| / measured from T = FIRST to LAST, for a gate that opens `shift` late."""
     here = (series.T >= FIRST) & (series.T <= LAST)
     known = series.value[here]
     return float(np.mean(np.abs(np.interp(series.T[here] - shift, T, value) - known) / known))
@@ -62,7 +62,7 @@ def best_shift(curves: Sequence[Series], T: np.ndarray, value: np.ndarray) -> tu
 
 
 class DamBreak(Case):
-    """A column a wide and 2 a high at rest, its pressure hydrostatic, whose gate is gone at t = 0; no friction."""
+    """A column of width a and height 2 a at rest with hydrostatic pressure, released at t = 0 without friction."""
 
     text = case_text("dam_break")
     name, title, group = "dam_break", "Dam break against the columns of Martin and Moyce", "fluids"
@@ -112,22 +112,22 @@ class DamBreak(Case):
         }
 
 
-# Of the tank and of the water, m.
+# Dimensions of the tank, m; start and depth of the water, m.
 LENGTH, WIDTH, HEIGHT = 3.22, 1.0, 1.0
 DAM, DEPTH = 1.992, 0.55
-# Two corners of the box, m, which stands on the floor.
+# Two corners of the obstacle, a box on the floor, m.
 LOWER, UPPER = (0.6635, 0.2955), (0.8245, 0.6985, 0.161)
-# Later water that the walls threw back comes down.
+# End of the run, s; later, water reflected by the walls falls back.
 END = 0.8
-# Those that are compared; they stand in the middle of the width, m.
+# Compared gauges, in the middle of the width, m.
 GAUGES = ("H2", "H3", "H4")
 MIDDLE = 0.5
-# A gauge is reached by the water where it reads this much, m. A dry one reads up to 1.5 mm.
+# Height at which the water has arrived at a gauge, m. A dry gauge reads up to 1.5 mm.
 WET = 0.01
 # Half the width of the columns in which the water of a simulation is measured, m.
 REACH = 1 / 16
-# The face of the obstacle that the front meets, m, its speed, m/s, from its times at x = 1.488 and 0.992 m, and when
-# it meets it, s.
+# Face of the obstacle that the front hits, m; speed of the front, m/s, from its times at x = 1.488 and 0.992 m; time of
+# impact, s.
 FACE = 0.8245
 SPEED = (1.488 - 0.992) / (0.358 - 0.194)
 IMPACT = 0.358 + (0.992 - FACE) / SPEED
@@ -135,7 +135,7 @@ IMPACT = 0.358 + (0.992 - FACE) / SPEED
 
 @dataclass(frozen=True)
 class Gauge:
-    """Where a height was measured, m, the first time with more than WET, s, and heights, m, at times, s, (n,) each."""
+    """Position of a gauge, m, first time with a height above WET, s, and heights, m, at times, s, (n,) each."""
 
     x: float
     arrival: float
@@ -143,7 +143,7 @@ class Gauge:
     height: np.ndarray
 
     def mean_error(self, time: np.ndarray, height: np.ndarray, last: float) -> float:
-        """Return the mean of |height - measured| of a curve from the arrival to a last time, over the mean measured."""
+        """Return the mean of |height - measured| from the arrival to time `last`, over the mean measured height."""
         here = (self.time > self.arrival) & (self.time <= last * (1 + 1e-9))
         known = self.height[here]
         return float(np.mean(np.abs(np.interp(self.time[here], time, height) - known)) / np.mean(known))
@@ -158,22 +158,22 @@ def measured_gauges() -> dict[str, Gauge]:
 
 
 def water_height(position: np.ndarray, x: float, volume: float, reach: float = REACH) -> float:
-    """Return how high the water of a column stands, m: its volume over its floor, so that a lone drop adds little.
+    """Return the height of the water in a column, m: volume over area, so that a single drop contributes little.
 
-    The column has no edge that a particle could jump over: what it holds counts by a hat function along both axes,
-    one in the middle, at the gauge, and zero at `reach`, m. Particles have one volume, m^3.
+    The weight of a particle is a hat function along both axes, 1 at the gauge and 0 at the distance `reach`, m, so that
+    the height is continuous. All particles have the same volume, m^3.
     """
     off = np.abs(position[:, :2] - [x, MIDDLE]) / reach
     return volume * float(np.prod(np.maximum(1 - off, 0.0), axis=1).sum()) / reach**2
 
 
 def impact(time: np.ndarray, front: np.ndarray) -> float:
-    """Return when the front, which comes from larger x, is at the obstacle, s."""
+    """Return the time at which the front, which comes from larger x, reaches the obstacle, s."""
     return float(np.interp(-FACE, -front, time))
 
 
 def arrival(time: np.ndarray, value: np.ndarray, level: float = WET) -> float:
-    """Return when a curve, such as the height at a gauge, rises above a level, s; nan where it never does."""
+    """Return the time at which a curve, such as the height at a gauge, first exceeds a level, s; nan if never."""
     above = value > level
     if not above.any():
         return math.nan
@@ -182,7 +182,7 @@ def arrival(time: np.ndarray, value: np.ndarray, level: float = WET) -> float:
 
 
 class DamBreakObstacle(Case):
-    """Water at rest at one end of a tank, its pressure hydrostatic, whose gate is gone at t = 0; no friction."""
+    """Water at rest at one end of a tank with hydrostatic pressure, released at t = 0 without friction."""
 
     text = case_text("dam_break_obstacle")
     name, title, group = "dam_break_obstacle", "Dam break on an obstacle, SPHERIC test 2", "fluids"
@@ -198,7 +198,7 @@ class DamBreakObstacle(Case):
         text.measure("first force (s)", 0.03),
         text.measure("peak (s)", 0.12),
         text.measure("largest force", 2.0),
-        # Rounding decides which drop gets deepest.
+        # Rounding affects which drop penetrates deepest.
         text.measure("depth in the box (h)", 0.5, rounding=0.5),
     )
     varies = ("precision",)
@@ -209,7 +209,7 @@ class DamBreakObstacle(Case):
         column = box([DAM, 0.0, 0.0], [LENGTH, WIDTH, DEPTH])
         return problem(
             {
-                # What is too long lies behind the box.
+                # The excess length of whole cells lies behind the obstacle.
                 "origin": [LENGTH - along * h, 0.0, 0.0],
                 "size": [along * h, WIDTH, up * h],
                 "cells": [along, n, up],
@@ -219,7 +219,7 @@ class DamBreakObstacle(Case):
             (END, 80),
             "velocity",
             [body("water", fluid(DENSITY, "auto"), column, initial_pressure="hydrostatic")],
-            # It reaches below the floor, so that no node of the floor under it is free.
+            # The obstacle extends below the floor, so that it covers the nodes of the floor below it.
             colliders=[{"name": "obstacle", "shape": box([*LOWER, -2 * h], UPPER)}],
         )
 
@@ -237,7 +237,7 @@ class DamBreakObstacle(Case):
         time, force = np.array(times), np.array(forces)
         curves = dict(zip(gauges, np.array(heights).T, strict=True))
         errors = [gauge.mean_error(time, curves[name], END) for name, gauge in gauges.items()]
-        # Forces are means since the frame before.
+        # Forces are means since the previous frame.
         middle = time - END / (2 * (len(time) - 1))
         face = (UPPER[1] - LOWER[1]) * UPPER[2]
         return {

@@ -1,4 +1,4 @@
-"""Dry sand: columns that collapse to a heap, beside experiments and models, and the friction angle that acts."""
+"""Dry sand: collapse of columns, compared with experiments and models, and the effective friction angle."""
 
 import math
 
@@ -10,14 +10,14 @@ from mpmcli.validation.shared import body, box, elastic, field, free_blocks, in_
 
 GRAVITY, DENSITY, REPOSE, NU = 9.81, 1600.0, 30.0, 0.3
 L0 = 0.2
-# Bulk modulus of the plane over density g H0: compressed by two thousandths at the base.
+# Bulk modulus in plane strain over density g H0: compression by two thousandths at the base.
 STIFFNESS = 500.0
-# End of the run, in sqrt(H0 / g): nothing moves any more.
+# End of the run, in sqrt(H0 / g), when the sand is at rest.
 UNITS = 5.0
 
 
 class SandColumn(Case):
-    """A column `aspect` times as high as wide, against a smooth wall and on a rough floor, that is let go."""
+    """A column `aspect` times as high as wide, released beside a smooth wall on a rough floor."""
 
     text = case_text("sand_column")
     group = "plastic"
@@ -31,15 +31,15 @@ class SandColumn(Case):
         refined: tuple[float, float, float],
         settled: tuple[float, float],
     ) -> None:
-        """`runout` and `height` are bands of (L - L0) / L0 and of H / L0; `resolutions`, those of the three levels.
+        """`runout` and `height` are bands of (L - L0) / L0 and of H / L0; `resolutions` has the finest of each level.
 
-        `refined` has R, A and a bound: the run-out is R - A / n as the grid is refined. `settled`: height and bound.
+        `refined` has R, A and a bound: the run-out converges as R - A / n. `settled` has the height and its bound.
         """
         self.aspect, self.runout, self.height = aspect, runout, height
         self.refined, self.settled = refined, settled
         self.name = f"sand_column_{aspect}"
         self.note = case_text(self.name).note
-        # What the knobs do shows in one of them.
+        # One of the columns covers the other settings.
         self.varies = ("precision", "kernel", "transfer") if aspect == 2 else ("precision",)
         self.title = f"Column of sand, height over width {aspect}"
         coarse, usual, fine = resolutions
@@ -47,10 +47,10 @@ class SandColumn(Case):
         middles = {"runout": sum(runout) / 2, "height": sum(height) / 2}
         text = self.text.filled(**middles, limit=refined[0], slope=refined[1], settled=settled[0])
         self.measures = (
-            # The grid cuts the toe short by as much as the refinement says.
+            # The grid shortens the toe by A / n.
             text.measure("run-out from mid-band (L0)", lambda n: (runout[1] - runout[0]) / 2 + refined[1] / n),
             text.measure("height from mid-band (L0)", (height[1] - height[0]) / 2),
-            # Rounding decides where grains roll to: run-outs differ by up to 0.1 from precision to precision.
+            # Rounding changes the paths of grains: run-outs differ by up to 0.1 between precisions.
             text.measure("run-out against refinement (L0)", refined[2], rounding=0.1),
             text.measure("height against refinement (L0)", settled[1], rounding=0.01),
             text.measure("run-out (L0)"),
@@ -62,7 +62,7 @@ class SandColumn(Case):
         h = L0 / n
         across, up = (2 + math.ceil(self.runout[1])) * n, self.aspect * n + 4
         height = self.aspect * L0
-        # E for K = lambda + mu, the bulk modulus of the plane.
+        # E for K = lambda + mu, the bulk modulus in plane strain.
         young = STIFFNESS * DENSITY * GRAVITY * height * 2 * (1 + NU) * (1 - 2 * NU)
         material = elastic("sand", DENSITY, young, NU, repose_angle=REPOSE)
         return problem(
@@ -93,21 +93,21 @@ class SandColumn(Case):
         }
 
 
-# The block that is sheared.
+# The sheared block.
 YOUNG, FRICTION = 1e7, 30.0
 MU, LAMBDA = lame_moduli(YOUNG, NU)
 WAVE_SPEED = math.sqrt((LAMBDA + 2 * MU) / DENSITY)
 SIZE = 0.2
-# ln J at the start: it presses by a thousandth of its bulk modulus.
+# Initial ln J: the pressure is a thousandth of the bulk modulus.
 SQUEEZE = -1e-3
-# Shear strain at the end, where half of a thousandth suffices: it slides from K |SQUEEZE| sin(phi) / (2 mu) on.
+# Final shear strain; the sand yields from K |SQUEEZE| sin(phi) / (2 mu), about half of a thousandth, on.
 SHEAR = 3e-3
-# A wave from the faces runs so far until then, and the middle is so wide, in parts of the size.
+# Distance that a wave travels from the faces until the end, and width of the middle, relative to the size.
 REACH, MIDDLE = 0.2, 0.2
 
 
 class SandShear(Case):
-    """A squeezed block, free all around, that is pressed along x and drawn along y: v = rate (-x, y), off its centre.
+    """A compressed free block that is pressed along x and stretched along y: v = rate (-x, y) from its centre.
 
     Its middle is sheared homogeneously until a wave arrives from the faces.
     """
@@ -135,7 +135,7 @@ class SandShear(Case):
         stress = field(last, "stress")[in_middle(last, scene, 0, MIDDLE * SIZE)].mean(axis=0).reshape(3, 3)
         ratio = (stress[0, 0] - stress[1, 1]) / (stress[0, 0] + stress[1, 1])
         volume = math.log1p(-(SHEAR**2)) + SQUEEZE
-        # Cauchy's stress is that of Hencky's strain over J.
+        # The Cauchy stress is that of the Hencky strain over J.
         known = -(LAMBDA + MU) * volume / math.exp(volume)
         return {
             "strength error": float(ratio / math.sin(math.radians(FRICTION)) - 1),
@@ -157,7 +157,7 @@ CASES = (
     SandColumn(
         2,
         (16, 32, 64),
-        # 1.2 a (Lube) and half as much again, and room around a^0.4 = 1.32: the band that judges MUD, an SPH code.
+        # 1.2 a (Lube) to 1.5 times that, and a band around a^0.4 = 1.32: as in the validation of MUD, an SPH code.
         (2.4, 3.6),
         (0.8, 1.7),
         (2.74, 7.2, 0.18),

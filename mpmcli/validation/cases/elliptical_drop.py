@@ -1,4 +1,4 @@
-"""The elliptical drop of Monaghan (1994): a free surface whose every particle has an exact path."""
+"""The elliptical drop of Monaghan (1994): a flow with a free surface and known particle paths."""
 
 import numpy as np
 
@@ -12,9 +12,9 @@ FRAMES = 4
 
 
 def half_axis(time: float) -> float:
-    """Return the half axis a(t) along x of a drop that is a disc, a(0) = 1, with v = (-x, y) at t = 0.
+    """Return the half axis a(t) along x of a drop that starts as a disc, a(0) = 1, with v = (-x, y).
 
-    The flow v = A (-x, y) keeps an ellipse of half axes a and 1/a and the energy A^2 (a^2 + a^-2). Hence
+    The flow v = A (-x, y) preserves an ellipse of half axes a and 1/a and the energy A^2 (a^2 + a^-2). Hence
     da/dt = -a A with A = sqrt(2 / (a^2 + a^-2)), integrated to 1e-13.
     """
     from scipy.integrate import solve_ivp
@@ -31,11 +31,11 @@ class EllipticalDrop(Case):
     name, title, group = "elliptical_drop", "Elliptical drop", "fluids"
     levels = {"coarse": (10, 20), "default": (10, 20, 40), "fine": (20, 40, 80)}  # noqa: RUF012
     measures = (
-        # 0.03 h of it by shifts, which move particles off their paths.
+        # Particle shifting, which moves particles off their paths, contributes 0.03 h.
         text.measure("position error (R)", lambda n: 2.1e-3 * 20 / n, expected=1.0),
-        # What compressibility adds, 1 / (4 SOUND^2), and a grid that is fine enough less.
+        # At most the effect of compressibility, 1 / (4 SOUND^2), and less on fine grids.
         text.measure("axes error", lambda n: min(1 / (4 * SOUND**2), 5e-4 + 1e-3 * 20 / n), expected=1.0),
-        # Shifts widen the drop by noise of the same size at any resolution.
+        # Particle shifting widens the drop by noise that does not depend on the resolution.
         text.measure("energy loss", 1.5e-4),
     )
 
@@ -58,7 +58,7 @@ class EllipticalDrop(Case):
             x, X = frame.position.astype(np.float64), field(frame, "initial_position")
         a = half_axis(END)
         exact = X * [a, 1 / a]
-        # From these particles, as a lattice in a disc does not have exactly the second moments of the disc.
+        # Relative to these particles, because a lattice in a disc does not have exactly the second moments of the disc.
         axes = np.sqrt((x**2).mean(0) / (exact**2).mean(0)) - 1
         return {
             "position error": float(np.sqrt(((x - exact) ** 2).sum(1).mean())),

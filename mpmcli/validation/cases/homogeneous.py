@@ -1,8 +1,8 @@
-"""Free blocks of four materials in homogeneous motion: every law's stress at large strain and rotation, in closed form.
+"""Free blocks of four materials in homogeneous motion: closed forms of the stress at large strain and rotation.
 
-A body whose velocity is linear in the place has homogeneous stress and feels no force, until waves come in from its
-faces: x = F X with F = I + t L. APIC carries linear fields exactly. What is left is quadrature: as the lattice of the
-particles shears against the grid, homogeneous stress makes small forces.
+A body whose velocity is linear in the position has homogeneous stress and no internal forces until waves arrive from
+its faces: x = F X with F = I + t L. APIC transfers linear fields exactly. The remaining error is that of quadrature: as
+the particle lattice shears relative to the grid, homogeneous stress causes small forces.
 """
 
 import math
@@ -18,7 +18,7 @@ MU, LAMBDA = lame_moduli(YOUNG, NU)
 SIZE = 0.5
 # t L at the end: a shear and a compression. F <- (I + dt C) F is exact, and so is J <- J det(I + dt C).
 FINAL = np.array([[-0.06, 0.3], [0.0, 0.0]])
-# A wave runs so far until then, and the middle is so wide, in parts of the size.
+# Distance that a wave travels until the end, and width of the middle, relative to the size.
 REACH, MIDDLE = 0.2, 0.1
 END = REACH * SIZE / math.sqrt((LAMBDA + 2 * MU) / DENSITY)
 YIELD, EXPONENT = 0.05 * MU, 7.0
@@ -48,7 +48,7 @@ def known_stress(name: str, F: np.ndarray) -> np.ndarray:
         case _:
             C = FINAL @ np.linalg.inv(F) / END
             pressure = BULK / EXPONENT * (J**-EXPONENT - 1)
-            # Per volume at rest, as all stress here: the viscosity is that of the fluid at rest.
+            # Kirchhoff stress, per volume at rest, as all stress here; the viscosity is that of the fluid at rest.
             viscous = VISCOSITY * (C + C.T - 2 / 3 * np.trace(C) * unit)
             tau = viscous - J * pressure * unit
     return tau / J

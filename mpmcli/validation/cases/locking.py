@@ -1,4 +1,4 @@
-"""Problems that lock where changes of volume are not averaged over cells: Cook's membrane, and Prandtl's punch."""
+"""Problems that lock unless volume changes are averaged over cells: Cook's membrane and Prandtl's punch."""
 
 import math
 
@@ -12,15 +12,15 @@ from mpmcli.validation.shared import after_ramp, body, box, elastic, field, lame
 CORNERS = (0.0, 0.0), (48.0, 44.0), (48.0, 60.0), (0.0, 44.0)
 YOUNG, RATIO, DENSITY = 250.0, 0.499, 1e-3
 SHEAR, LAME = lame_moduli(YOUNG, RATIO)
-# Width of the strip that is pulled, m, and the force on it over its area, N/m^2.
+# Width of the loaded strip, m, and the force on it per area, N/m^2.
 STRIP, PULL = 2.0, 0.2
-# About the first period, s. In such periods: the ramp, and the window of the mean.
+# Approximate first period, s. In units of it: the ramp and the averaging window.
 PERIOD = 7 * CORNERS[1][0] / math.sqrt(SHEAR / DENSITY)
 RAMP, WINDOW, FRAMES_PER_PERIOD = 3, 2, 24
 # Prandtl's punch: half of its width and the extent of the clay, m; undrained strength, stiffness, Pa, and density.
 HALF, WIDE, DEEP = 1.0, 5.0, 3.0
 STRENGTH, STIFFNESS, CLAY = 1e4, 1e7, 2000.0
-# How far and how fast the punch goes, m and s, and the part of its way over which the load is averaged.
+# Travel of the punch, m, its duration, s, and the last fraction of it over which the load is averaged.
 PUSH, TIME, LOOKED_AT = 0.04, 2.0, 0.5
 # Displacement along y of the middle of the right side of Cook's membrane, m, by biquadratic elements in plane strain
 # that do not lock, as in tests/test_validation_statics.py.
@@ -60,7 +60,7 @@ class Membrane(Case):
 
 
 class Punch(Case):
-    """A strip of the surface of weightless clay is pushed in by springs; half of it, beside a plane of symmetry."""
+    """A strip of the surface of weightless clay, pushed in by springs; half of it, beside a plane of symmetry."""
 
     text = case_text("prandtl")
     name, title, group = "prandtl", "Prandtl's punch: the bearing capacity of clay", "plastic"
@@ -69,8 +69,8 @@ class Punch(Case):
     levels = {"coarse": (4, 8), "default": (8, 16), "fine": (8, 16, 32)}  # noqa: RUF012
     measures = (
         Measure(
-            f"load: Load on the punch over its width and (2 + pi) c, less 1: mean over the last {LOOKED_AT:.0%} of its "
-            "way.",
+            f"load: Load on the punch over its width and (2 + pi) c, minus 1: mean over the last {LOOKED_AT:.0%} of "
+            "its travel.",
             lambda n: 1.4 / n,
             order=0.6,
         ),
@@ -90,7 +90,7 @@ class Punch(Case):
 
     @staticmethod
     def spring(h: float) -> float:
-        """Return the acceleration per displacement, 1/s^2, of the top layer of cells: c stretches it by PUSH / 400."""
+        """Return the spring constant over mass, 1/s^2, of the top layer of cells: c stretches it by PUSH / 400."""
         return 400 * STRENGTH / (CLAY * PUSH * h)
 
     def measure(self, n: int, scene: Scene, frames: Frames) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""Manufactured solutions: a standing wave, and a ring sheared far and back, by a body force (docs/theory.md, 10)."""
+"""Manufactured solutions with body forces: a standing wave, and a ring in large cyclic shear (docs/theory.md, 10)."""
 
 import math
 from collections.abc import Callable
@@ -18,13 +18,13 @@ AXES = ("X", "Y", "Z")
 
 @dataclass(frozen=True)
 class StandingWave:
-    """The motion, the force and the stress of a solid of one of two laws; `signs` has s_i, one per axis that moves.
+    """Motion, force and stress of a neo-Hookean or fixed corotated solid; `signs` has s_i, one per moving axis.
 
     Along each axis i, with s_i = 1 or -1 (phases 0 and pi of Wallstedt and Guilkey 2008), in a unit square or cube of
     density 1 at rest between slip walls:
         u_i = s_i A sin(k X_i) sin(w t), so that F is diagonal with F_i = 1 + s_i A k cos(k X_i) sin(w t),
         b_i = d2u_i/dt2 - dP_ii/dX_i, with dF_i/dX_i = -k^2 u_i.
-    At t = 0 nothing is displaced. Moduli are in Pa, the amplitude A in m.
+    At t = 0 the displacement is zero. Moduli are in Pa, the amplitude A in m.
     """
 
     law: str
@@ -41,12 +41,12 @@ class StandingWave:
         return math.pi * math.sqrt(self.young)
 
     def velocity(self) -> list[str]:
-        """Return the initial velocity, m/s, as expressions of a scene, one per axis that moves."""
+        """Return the initial velocity, m/s, as expressions of a scene, one per moving axis."""
         peak = self.amplitude * self.frequency
         return [f"{sign * peak!r} * sin({self._wave} * {name})" for sign, name in zip(self.signs, AXES, strict=False)]
 
     def force(self) -> list[str]:
-        """Return b, m/s^2, as expressions of a scene, one per axis that moves."""
+        """Return b, m/s^2, as expressions of a scene, one per moving axis."""
         mu, lam = lame_moduli(self.young, self.poisson)
         k2 = (self.half_waves * math.pi) ** 2
         swing = f"sin({self.frequency!r} * t)"
@@ -70,7 +70,7 @@ class StandingWave:
         return texts
 
     def displacement(self, X: np.ndarray, time: float) -> np.ndarray:
-        """Return u, (n, d), m, of particles that began at X, (n, d), m: only the axes that move."""
+        """Return u, (n, d), m, of particles that start at X, (n, d), m: only the moving axes."""
         signs = np.array(self.signs)
         moving = X[:, : len(signs)]
         return signs * self.amplitude * np.sin(self.half_waves * np.pi * moving) * np.sin(self.frequency * time)
@@ -119,13 +119,13 @@ class ManufacturedWave(Case):
         note: str = "",
         solids: str = "updated",
     ) -> None:
-        """`error` and `stress` are their bounds, that of the error at n = 16 and at most resolutions.
+        """`error` has the bounds of the displacement error at n = 16 and 32 (see `_displacement`), `stress` its bound.
 
         `note` is the name of the text with the note, by default that of the case.
         """
         self.name, self.title, self.wave, self.solids = name, f"Manufactured wave in a {title}", wave, solids
         self.source = STEFFEN if len(wave.signs) == 1 else WALLSTEDT
-        # What the knobs do shows with the other law.
+        # The cases with the other law cover the other settings.
         self.varies = ("precision",) if wave.law == "fixed_corotated" else Case.varies
         self.levels = CUBE_LEVELS if len(wave.signs) == 3 else LEVELS
         total = solids == "total"
@@ -184,7 +184,7 @@ def _second_order(n: int, at_16: float, least: float) -> float:
 
 
 def _displacement(n: int, at_16: float, at_32: float) -> float:
-    """Return the bound: of second order, and no less than the error of quadrature, which halves once more at 64."""
+    """Return the bound: second order, but at least the quadrature error, which halves once more at n = 64."""
     return _second_order(n, at_16, at_32 * max(32 / n, 0.5))
 
 
@@ -206,7 +206,7 @@ MARGIN = 0.25
 
 
 def turn(R: np.ndarray, time: float) -> np.ndarray:
-    """Return the angle alpha, rad, by which a circle of radius R, m, is turned at a time, s."""
+    """Return the angle alpha, rad, by which a circle of radius R, m, is rotated at a time, s."""
     s = (R - MIDDLE) / HALF
     shape = np.where(np.abs(s) < 1, (1 - s**2) ** 2, 0.0)
     return ANGLE * (1 - math.cos(2 * math.pi * time / PERIOD)) / 2 * shape
@@ -215,12 +215,12 @@ def turn(R: np.ndarray, time: float) -> np.ndarray:
 def body_force() -> list[str]:
     """Return the acceleration, m/s^2, as expressions of a scene.
 
-    With kappa = R dalpha/dR, P is mu (F - F^-T), as J = 1, and
+    With kappa = R dalpha/dR and J = 1, P = mu (F - F^-T) and
 
         a_r = mu kappa^2 / (rho R) - R (dalpha/dt)^2,
         a_theta = R d2alpha/dt2 - mu (dkappa/dR + 2 kappa / R) / rho
 
-    along the directions that the motion has turned.
+    along the radial and tangential directions at the current position.
     """
     R, w = "hypot(X, Y)", 2 * math.pi / PERIOD
     s = f"(({R} - {MIDDLE}) / {HALF})"
@@ -245,7 +245,7 @@ def body_force() -> list[str]:
 
 
 class Vortex(Case):
-    """Circles between R = 0.75 and 1.25 m turn by alpha(R, t) and back; what lies inside them stays at rest."""
+    """Circles between R = 0.75 and 1.25 m rotate by alpha(R, t) and back; the material inside them stays at rest."""
 
     text = case_text("vortex")
     name, title, group = "vortex", "Large shear and back: the generalized vortex", "solids"

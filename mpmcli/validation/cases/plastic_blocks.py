@@ -1,8 +1,8 @@
 """Free blocks of one law each in homogeneous motion: hardening, cohesion, tearing, viscous flow, in 2D and 3D.
 
-As in `homogeneous`, a block whose velocity is linear in the place feels no force until waves come in from its faces:
-F = I + t L. Paths are such that principal directions and the ratios of the plastic strains stay the same, so that the
-stress is a closed form of F at the end, for any number of steps.
+As in `homogeneous`, a block whose velocity is linear in the position has no internal forces until waves arrive from its
+faces: F = I + t L. Principal directions and the ratios of the plastic strains are constant along the paths, so that the
+stress is a closed form of the final F, for any number of steps.
 """
 
 import math
@@ -18,24 +18,24 @@ from mpmcli.validation.shared import body, elastic, field, fluid, free_blocks, i
 DENSITY, YOUNG, NU = 1000.0, 1e6, 0.1
 MU, LAMBDA = lame_moduli(YOUNG, NU)
 SIZE = 0.5
-# Width of the middle that is looked at, in parts of the size, and empty cells around a block.
+# Width of the evaluated middle, relative to the size, and empty cells around a block.
 MIDDLE, GAP = 0.15, 4
-# A wave runs so far until the end, in parts of the size.
+# Distance that a wave travels until the end, relative to the size.
 REACH = 0.2
 END = REACH * SIZE / math.sqrt((LAMBDA + 2 * MU) / DENSITY)
-# Least bound on an error: what the tails of waves, which the grid carries ahead, bring to the middle.
+# Smallest bound of an error: effect of numerical precursors of the waves on the middle.
 LEAST = 1e-6
 
 YIELD, HARDENING = 0.02 * MU, MU
 FRICTION, COHESION = 30.0, 0.002 * MU
 COMPRESSION, STRETCH, SNOW_HARDENING = 0.025, 0.0075, 10.0
-# The paste forgets its stress 40 times until the end, and half of its stress is viscous.
+# The run takes 40 relaxation times of the paste, and half of its stress is viscous.
 PASTE_YIELD = 0.0025 * MU
 CONSISTENCY = MU * END / 40
 BULK, BULK_VISCOSITY, VISCOSITY = MU, 0.1 * MU * END, 0.1 * MU * END
-# So soft that hardly a wave runs in it.
+# Soft enough that waves hardly propagate.
 SOFT = BULK / 20
-# The sand that opens swings as cos wt + s sin wt, and ends pressed by a two-hundredth.
+# The stretch of the sand that opens is cos wt + s sin wt; it ends at CLOSED, compressed by 0.5 %.
 SWING, CLOSED = 0.5 / END, 0.995
 OPENING = (CLOSED - math.cos(SWING * END)) / math.sin(SWING * END)
 
@@ -52,12 +52,12 @@ OIL = WATER | {"bulk_viscosity": BULK_VISCOSITY, "viscosity": VISCOSITY}
 
 @dataclass(frozen=True)
 class Block:
-    """One block, whose measure is the error of its Kirchhoff stress, d x d, Pa, nan where `stress` does not know it.
+    """A block, whose measure is the error of its Kirchhoff stress, d x d, Pa; unknown entries of `stress` are nan.
 
-    At the end it is stretched by `last` along the last axis, by `everywhere` along all, and the first axis is sheared
-    along the last. The error is set over a scale, or the norm of the known stress; at n = 32 it has `noise` of
-    quadrature, which grows as n^2, and the `lag` of the step, which falls as 1/n. Where the block swings, a force that
-    is linear in the place drives it, from `motion` as rate times END.
+    At the end it is stretched by `last` along the last axis and by `everywhere` along all, and the first axis is
+    sheared along the last. The error is relative to `scale`, or to the norm of the known stress. At n = 32 it has the
+    quadrature error `noise`, which grows as n^2, and the time step error `lag`, which falls as 1/n. If `swings`, a body
+    force linear in the position drives the block, and `motion` is its initial rate times END.
     """
 
     name: str
@@ -84,7 +84,7 @@ class Block:
 
 
 def hardened(F: np.ndarray) -> np.ndarray:
-    """Return K ln J I and a deviator of sqrt(3/2) |s| = yield + H a, in uniaxial strain: a by consistency."""
+    """Return K ln J I plus a deviator s, sqrt(3/2) |s| = yield + H a, in uniaxial strain; a from consistency."""
     strain = math.log(F[-1, -1])
     plastic = (2 * MU * abs(strain) - YIELD) / (3 * MU + HARDENING)
     q = math.copysign(YIELD + HARDENING * plastic, strain)
@@ -103,12 +103,12 @@ def pressed(F: np.ndarray) -> np.ndarray:
 
 
 def at_the_tip(F: np.ndarray) -> np.ndarray:
-    """Return the tension that damp sand bears, c cot(phi)."""
+    """Return the tension at the apex of the cone of damp sand, c cot(phi)."""
     return COHESION / math.tan(math.radians(FRICTION)) * np.eye(len(F))
 
 
 def reopened(F: np.ndarray) -> np.ndarray:
-    """Return K ln J I: pressure since the volume is less than at the start, not since it began to fall."""
+    """Return K ln J I: the pressure rises once the volume is less than at the start, not once it decreases."""
     d = len(F)
     return (LAMBDA + 2 * MU / d) * math.log(np.linalg.det(F)) * np.eye(d)
 
@@ -122,7 +122,7 @@ def snow(F: np.ndarray) -> np.ndarray:
 
 
 def flowing(F: np.ndarray) -> np.ndarray:
-    """Return a shear stress of the yield stress and consistency times the shear rate; normal stresses are left open."""
+    """Return the shear stress, yield stress plus consistency times the shear rate; other entries are nan."""
     d = len(F)
     tau = np.full((d, d), np.nan)
     tau[0, -1] = tau[-1, 0] = PASTE_YIELD + CONSISTENCY * F[0, -1] / END
@@ -137,7 +137,7 @@ def resting(F: np.ndarray) -> np.ndarray:
 
 
 def squeezed(F: np.ndarray) -> np.ndarray:
-    """Return (K (J - 1) + (bulk viscosity - 2/3 viscosity) tr C) I + viscosity (C + C^T); C as it is at the end."""
+    """Return (K (J - 1) + (bulk viscosity - 2/3 viscosity) tr C) I + viscosity (C + C^T), with the final C."""
     d, J = len(F), np.linalg.det(F)
     C = (F - np.eye(d)) @ np.linalg.inv(F) / END
     spherical = BULK * (J - 1) + (BULK_VISCOSITY - 2 / 3 * VISCOSITY) * np.trace(C)
@@ -145,7 +145,7 @@ def squeezed(F: np.ndarray) -> np.ndarray:
 
 
 def compressed(F: np.ndarray) -> np.ndarray:
-    """Return K (J - 1) I, of the soft fluid."""
+    """Return K (J - 1) I of the soft fluid."""
     return SOFT * (np.linalg.det(F) - 1) * np.eye(len(F))
 
 
@@ -165,7 +165,7 @@ BLOCKS = (
 
 
 class PlasticBlocks(Case):
-    """v = L (x - c) in free blocks of one law, a path each."""
+    """v = L (x - c) in free blocks of one law, each on its own path."""
 
     text = case_text("plastic_blocks")
     group = "plastic"
@@ -203,7 +203,7 @@ class PlasticBlocks(Case):
             middle = in_middle(last, scene, k, MIDDLE * SIZE)
             F = np.eye(d) + block.motion(d)
             if block.swings:
-                # As the places have it: the force, step by step, leaves it off by (swing dt)^2.
+                # F from the positions: integration of the force in steps has an error of (swing dt)^2.
                 x = last.position[middle, 0].astype(np.float64)
                 F = np.polyfit(start[middle, 0], x, 1)[0] * np.eye(d)
             known = block.stress(F)

@@ -1,4 +1,4 @@
-"""Snow pressed together in a shaft: the closed form of its confined compression (Stomakhin et al. 2013)."""
+"""Snow compressed in a shaft: the closed form of confined compression (Stomakhin et al. 2013)."""
 
 import numpy as np
 
@@ -9,23 +9,23 @@ from mpmcli.validation.shared import body, elastic, field, lame_moduli, problem,
 DENSITY, DEPTH = 400.0, 1.0
 YOUNG, NU, COMPRESSION, HARDENING = 1.4e5, 0.2, 0.025, 10.0
 MU, LAMBDA = lame_moduli(YOUNG, NU)
-# Gravity grows to this, m/s^2, within so long, s, many times as long as a wave takes there and back: the lowest snow
-# ends at 0.8 of its height, the last row of the table.
+# Final gravity, m/s^2, and its rise time, s, many times the travel time of a wave up and down the shaft. The lowest
+# snow ends at 0.8 of its height.
 PULL, DURATION = 70.0, 3.0
 
 
 def confined_stress(stretch: np.ndarray) -> np.ndarray:
     """Return the Cauchy stress along the axis at a stretch below 1, Pa (docs/theory.md, 5.6).
 
-    sigma = exp(xi (1 - J_P)) (2 mu (s - 1) s + lambda (J_E - 1) J_E) / J with the elastic stretch s = J_E, which is
-    the stretch up to the critical compression, and J_P what is left of J.
+    sigma = exp(xi (1 - J_P)) (2 mu (s - 1) s + lambda (J_E - 1) J_E) / J. The elastic stretch s = J_E is the stretch,
+    limited by the critical compression, and J_P = J / J_E.
     """
     s = np.maximum(stretch, 1 - COMPRESSION)
     return np.exp(HARDENING * (1 - stretch / s)) * (2 * MU + LAMBDA) * (s - 1) * s / stretch
 
 
 class SnowOedometer(Case):
-    """A shaft of snow between slip walls, in which gravity grows slowly: every height is at another compression."""
+    """A shaft of snow between slip walls with slowly increasing gravity: the compression varies with height."""
 
     text = case_text("snow_oedometer")
     name, title, group = "snow_oedometer", "Snow pressed together in a shaft", "plastic"
@@ -64,9 +64,10 @@ class SnowOedometer(Case):
 
 
 def confined_height(Y: float) -> float:
-    """Return the height of the snow that began at Y, m, under the weight of what is above.
+    """Return the final height, m, of the snow that starts at Y, m, under the weight of the snow above.
 
-    The stretch at each height is where the closed form, which grows with compression, reaches the weight.
+    The stretch at each height is that at which the stress of the closed form, which increases with compression, equals
+    the weight.
     """
     stretch = np.linspace(1.0, 0.7, 20001)
     heights = (np.arange(2000) + 0.5) * Y / 2000

@@ -1,4 +1,4 @@
-"""An elastic disc that turns, stretched by its own turning: what ten turns take from it."""
+"""A rotating elastic disc, stretched by centrifugal forces: energy, angle and angular momentum after ten turns."""
 
 import math
 
@@ -17,9 +17,9 @@ STRETCH = (1 + POISSON) * (1 - 2 * POISSON) * DENSITY * SPIN**2 / (8 * YOUNG * (
 
 
 class SpinningDisc(Case):
-    """A rigid rotation is affine, which APIC transfers exactly; the stress holds the disc together, and does no work.
+    """APIC transfers a rigid rotation, an affine motion, exactly; the stress holds the disc together and does no work.
 
-    F is I plus the gradient of the plane-strain solution, taken where the particles start.
+    The initial F is I plus the gradient of the plane-strain displacement at the initial positions.
     """
 
     text = case_text("spinning_disc")

@@ -1,4 +1,4 @@
-"""Water in tanks, and sand: a standing wave, a column, a box that floats, and volumes after a stir."""
+"""Water and sand in tanks: a standing wave, a column, a floating box, and volumes after violent motion."""
 
 import math
 from dataclasses import replace
@@ -24,9 +24,9 @@ def standing_wave_frequency(gravity: float, wave_number: float, depth: float, am
     return math.sqrt(gravity * wave_number) * (w + (amplitude * wave_number) ** 2 / 2 * curvature)
 
 
-# The tank of the wave, m.
+# Length of the tank, depth of the water and amplitude of the wave, m.
 LENGTH, DEPTH, AMPLITUDE = 1.0, 0.5, 0.02
-# Sound ten times as fast as what falls from the surface to the floor.
+# The speed of sound is ten times that of free fall from the surface to the floor.
 MODULUS = 100 * 2 * DENSITY * GRAVITY * DEPTH
 WAVE_NUMBER = math.pi / LENGTH
 LINEAR = standing_wave_frequency(GRAVITY, WAVE_NUMBER, DEPTH)
@@ -36,7 +36,7 @@ FRAMES_PER_PERIOD = 24
 
 
 class Sloshing(Case):
-    """From flat, with v = a w (-sin kX cosh kY, cos kX sinh kY)/sinh kd: the centre of mass swings at w."""
+    """Initially flat, with v = a w (-sin kX cosh kY, cos kX sinh kY)/sinh kd: the centre of mass oscillates at w."""
 
     text = case_text("sloshing")
     name, title, group = "sloshing", "Sloshing in a tank", "fluids"
@@ -70,10 +70,10 @@ class Sloshing(Case):
         }
 
 
-# Of the column, m.
+# Height of the column, m.
 HEIGHT = 1.0
 WEIGHT = DENSITY * GRAVITY * HEIGHT
-# Terms of the series of a triangle; the first one left out has 1e-6 of the first.
+# Terms of the series of a triangle wave; the first omitted term is 1e-6 of the first.
 TERMS = 500
 
 
@@ -85,7 +85,7 @@ def column(n: int, modulus: float, time: tuple[float, int], **start: str) -> Tab
 
 
 class Hydrostatic(Case):
-    """p = density g (H - Y) from the start, and nothing moves."""
+    """p = density g (H - Y) from the start; the column stays at rest."""
 
     text = case_text("hydrostatic")
     name, title, group = "hydrostatic", "Hydrostatic column", "fluids"
@@ -107,7 +107,7 @@ class Hydrostatic(Case):
             exact = WEIGHT * (1 - Y / HEIGHT)
             errors.append(np.linalg.norm(pressure * frame.fields["volume_ratio"] - exact) / np.linalg.norm(exact))
             speeds.append(row.speed_max)
-            # About the mean of all that began at a height.
+            # About the mean of particles with the same initial height.
             _, rows = np.unique(np.round(Y, 6), return_inverse=True)
             spreads.append(np.std(pressure - (np.bincount(rows, pressure) / np.bincount(rows))[rows]))
         return {
@@ -118,14 +118,14 @@ class Hydrostatic(Case):
 
 
 class HydrostaticDrop(Case):
-    """Gravity switched on at t = 0: the base feels a triangle between 0 and 2 density g H, of period 4 H/c."""
+    """Gravity switched on at t = 0: the base pressure is a triangle wave from 0 to 2 density g H, period 4 H/c."""
 
     text = case_text("hydrostatic_drop")
     name, title, group = "hydrostatic_drop", "Column of water let go", "fluids"
     varies = ("precision", "transfer")
     levels = {"coarse": (16, 32), "default": (16, 32, 64), "fine": (32, 64, 128)}  # noqa: RUF012
-    # Stiff, so that the column is nearly linear: its weight at rest compresses it by 0.1 % at the base. Sound runs as
-    # much faster as it is compressed, by half of that along each characteristic, whenever that starts.
+    # Stiff, so that the column is nearly linear: its weight at rest compresses it by 0.1 % at the base. The speed of
+    # sound rises in proportion to the compression: by half of that along each characteristic, whenever that starts.
     modulus = 1000 * WEIGHT
     period = 4 * HEIGHT / math.sqrt(modulus / DENSITY) * (1 - WEIGHT / modulus / 2)
     periods = 3
@@ -152,7 +152,7 @@ class HydrostaticDrop(Case):
             times.append(frame.time)
             base.append(pressure[row == 0].mean())
             exact_base.append(exact[0])
-        # The phase of the first harmonic, period by period: the others of a triangle are orthogonal to it there.
+        # Phase of the first harmonic in each period: the other harmonics of a triangle wave are orthogonal to it.
         turns = np.exp(-2j * math.pi / self.period * np.array(times[1:])) * base[1:]
         phases = turns.reshape(self.periods, -1).mean(1)
         lead = np.angle(phases[-1] / phases[0]) / (2 * math.pi * (self.periods - 1))
@@ -163,20 +163,20 @@ class HydrostaticDrop(Case):
         }
 
 
-# The density of the box, over that of water; its height, m; the tank, in heights of the box; its angle at the start,
-# degrees.
+# Density of the box over that of water; its height, m; size of the tank, in heights of the box; initial angle of the
+# box, degrees.
 SHARE, BOX, TANK, TILT = 0.5, 0.4, (6.0, 4.0), 10.0
 END, FRAMES, STILL = 4.0, 80, 60
 
 
 class FloatingBox(Case):
-    """A box twice as wide as it is high, let go from a tilt; it is measured over the last second."""
+    """A box twice as wide as high, released at a tilt; the measures are means over the last second."""
 
     text = case_text("floating_box")
     name, title, group = "floating_box", "Rigid box that floats", "fluids"
     levels = {"coarse": (8,), "default": (8, 16), "fine": (8, 16, 32)}  # noqa: RUF012
     varies = ("precision", "per_axis")
-    # Nodes meet colliders up to three quarters of a cell outside.
+    # Colliders act on nodes up to three quarters of a cell outside.
     measures = (
         text.measure("draught error", lambda n: 0.35 / n, expected=1.0),
         text.measure("force error", 0.01, rounding=1e-3),
@@ -198,7 +198,7 @@ class FloatingBox(Case):
         rows = [row for _, row in frames][STILL:]
         pose = np.array([row.rigid_pose[0] for row in rows]).mean(axis=0)
         mass = scene.colliders[0].moments.mass
-        # Water, and what the box displaces, below the level.
+        # The volume below the level is that of the water and that displaced by the box.
         level = (rows[0].mass + mass) / DENSITY / scene.domain.size[0]
         force = float(np.mean([row.collider_force[0][1] for row in rows]))
         return {
@@ -210,12 +210,12 @@ class FloatingBox(Case):
 
 WATER = {"law": "fluid", "density": 1000.0}
 SAND = {"law": "sand", "density": 1600.0, "friction_angle": 30.0}
-# What has come to rest fills the same volume to this fraction.
+# Admissible relative change of the volume at rest.
 TOLERANCE = 0.02
 
 
 class VolumeAtRest(Case):
-    """The depth of a pool when it is quiet again, over what its volume amounts to between walls.
+    """The depth of a pool at rest after motion, over the depth of its initial volume between the walls.
 
     The depth is averaged from `start`, s, to the end. `h` and `cells` are those of the domain at resolution 1, `time`
     the end and the number of frames; `width`, `height` and `state` describe the body, a box in the lower left corner.
@@ -248,19 +248,19 @@ class VolumeAtRest(Case):
         return problem(domain, self.time, "velocity", [block], forces=[*self.forces])
 
     def measure(self, n: int, scene: Scene, frames: Frames) -> dict[str, float]:
-        # A small wave has as much potential energy, above that of the level, as kinetic energy.
+        # The potential energy of a small wave, above that of the level, equals its kinetic energy.
         heights = [
             frame.position[:, 1].astype(np.float64).mean() - row.kinetic / row.mass / GRAVITY
             for frame, row in frames
             if frame.time >= self.start
         ]
-        # A window, so that it does not matter where in a period the run ends.
+        # With a window the mean does not depend on the phase at which the run ends.
         window = np.hanning(len(heights) + 2)[1:-1]
         return {"volume error": 2 * float(np.average(heights, weights=window)) / self.depth - 1}
 
 
 class Toss(VolumeAtRest):
-    """A pool 0.6 m wide and 0.3 m deep, thrown up by v = 2 Y/0.3 m/s: it opens everywhere, and falls back."""
+    """A pool 0.6 m wide and 0.3 m deep, thrown up by v = 2 Y/0.3 m/s: it opens everywhere and falls back."""
 
     text = case_text("toss")
     name, title, group = "toss", "Water tossed up", "fluids"
@@ -271,7 +271,7 @@ class Toss(VolumeAtRest):
 
 
 class SandToss(VolumeAtRest):
-    """A layer of sand 0.4 m wide and 0.2 m deep, thrown up by v = 4 Y/0.2 m/s: its grains part, and rain down."""
+    """A layer of sand 0.4 m wide and 0.2 m deep, thrown up by v = 4 Y/0.2 m/s: its grains separate and fall back."""
 
     text = case_text("sand_toss")
     name, title, group = "sand_toss", "Sand tossed up", "plastic"
@@ -279,22 +279,22 @@ class SandToss(VolumeAtRest):
     depth, start = 0.2, 1.1
     h, cells, walls, time = 0.025, (16, 56), {"default": "slip", "y_min": "stick"}, (1.3, 26)
     material, width, height, state = SAND, 0.4, 0.2, {"velocity": ["0", "4*Y/0.2"]}
-    # Where grains fall among others rounding decides: what comes of it differs by as much as between lattices.
+    # Rounding affects where grains fall: results differ by as much as between lattices.
     measures = tuple(replace(measure, rounding=TOLERANCE) for measure in VolumeAtRest.measures)
 
 
 class DamAtRest(VolumeAtRest):
-    """The dam break of a column 0.25 m wide and 0.5 m high in a tank 1 m long, until it is quiet."""
+    """The dam break of a column 0.25 m wide and 0.5 m high in a tank 1 m long, until it is at rest."""
 
     name, title, group = "dam_at_rest", "Dam break, at rest again", "fluids"
     depth, start = 0.125, 8.0
     cells, time = (32, 32), (12.0, 240)
     width, height = 0.25, 0.5
-    note = "Without relaxation towards the density of the grid a tenth of the volume is gone."
+    note = "Without relaxation towards the density of the grid a tenth of the volume is lost."
 
 
 class StirredPool(VolumeAtRest):
-    """A pool 1 m wide and six cells deep, rocked for 30 s near its lowest frequency, after 36 s."""
+    """A pool 1 m wide and six cells deep, excited for 30 s near its lowest frequency, at 36 s."""
 
     name, title, group = "stirred_pool", "Stirred pool", "fluids"
     levels = {"coarse": (1,), "default": (1,), "fine": (1, 2)}  # noqa: RUF012
@@ -302,4 +302,4 @@ class StirredPool(VolumeAtRest):
     cells, time = (32, 16), (36.0, 720)
     width, height = 1.0, 6 / 32
     forces = ({"acceleration": ["sin(4.04 * t) if t < 30 else 0", 0.0]},)
-    note = "Without relaxation towards the density of the grid a sixth of the volume is gone."
+    note = "Without relaxation towards the density of the grid a sixth of the volume is lost."

@@ -1,4 +1,4 @@
-"""A Taylor-Green vortex in a slip box: viscosity, that of the fluid and that of the transfers."""
+"""A Taylor-Green vortex in a slip box: viscosity of the fluid and numerical viscosity of the transfers."""
 
 import math
 from collections.abc import Sequence
@@ -21,14 +21,14 @@ DECAY = 4 * VISCOSITY * K**2
 def apic_factor(angles: Sequence[float], places: np.ndarray | None = None) -> float:
     """Return the amplification factor of a velocity wave exp(i k.x) in a step without forces, with quadratic weights.
 
-    Nodes hold one number per wave, so that a step multiplies it: with the weights w_i and the levers x_i - x_p in
-    cells, by the mean over particles of |sum w_i e_i|^2 + 4 |sum w_i (x_i - x_p) e_i|^2, e_i = exp(i k.x_i). On a
-    lattice it is a product over axes: A A + A B + B A in 2D. Hence 1 - 0.024 (kh)^4 along an axis, and
-    1 - 0.110 (kh)^4 for the wave vector (k, k) (docs/theory.md, 2.4). `angles` are k h along each axis, `places` those
-    of particles along each axis, in cells from the nearest node; uniform by default.
+    A step multiplies the nodal amplitude of the wave by the mean over particles of
+    |sum w_i e_i|^2 + 4 |sum w_i (x_i - x_p) e_i|^2, with the weights w_i, the offsets x_i - x_p in cells, and
+    e_i = exp(i k.x_i). On a lattice it is a product over axes: A A + A B + B A in 2D. Hence 1 - 0.024 (kh)^4 along an
+    axis, and 1 - 0.110 (kh)^4 for the wave vector (k, k) (docs/theory.md, 2.4). `angles` are k h along each axis,
+    `places` the positions of particles along each axis, in cells from the nearest node; uniform by default.
     """
     if places is None:
-        # Polynomials of the sixth degree in the place: four points of Gauss are exact.
+        # The integrands are polynomials of degree six in the position: four-point Gauss quadrature is exact.
         points, parts = np.polynomial.legendre.leggauss(4)
         places, parts = points / 2, parts / 2
     else:
@@ -45,12 +45,12 @@ def apic_factor(angles: Sequence[float], places: np.ndarray | None = None) -> fl
 
 
 def predicted_decay(h: float, step: float) -> float:
-    """Return how fast APIC with quadratic weights takes kinetic energy out of the vortex, 1/s, at a step in s."""
+    """Return the decay rate of the kinetic energy of the vortex by APIC with quadratic weights, 1/s; `step` in s."""
     return -2 * math.log(apic_factor([K * h, K * h])) / step
 
 
 def excess(n: int) -> float:
-    """Return the predicted decay over that of viscosity, at the steps of the default setting."""
+    """Return the ratio of the predicted decay rate to that of viscosity, at the steps of the default setting."""
     return predicted_decay(1 / n, 0.8 / (n * math.sqrt(2) * SOUND)) / DECAY
 
 
@@ -63,7 +63,7 @@ class TaylorGreen(Case):
     measures = (
         text.measure("decay error", lambda n: 1.05 * excess(n) + 0.014, order=0.9, expected=3.0),
         text.measure("decay unexplained", lambda n: 0.02 * (16 / n) ** 0.6),
-        # What the transfers take until then, and the noise of the particles.
+        # Damping by the transfers until END, and noise of the particles.
         text.measure("velocity error", lambda n: 1.25 * (1 - math.exp(-0.5 * DECAY * END * excess(n))) + 0.25 / n),
     )
 
@@ -71,11 +71,11 @@ class TaylorGreen(Case):
         modulus = SOUND**2
         vortex = body(
             "fluid",
-            # The flow takes no tension; the noise of the particles' pressures must not be cut on one side.
+            # The flow has no tension; the noise of particle pressures must not be cut off on one side.
             fluid(1.0, modulus, viscosity=VISCOSITY, tension_cutoff=False),
             box([0.0, 0.0], [1.0, 1.0]),
             velocity=["sin(pi * X) * cos(pi * Y)", "-cos(pi * X) * sin(pi * Y)"],
-            # p = K (1/J - 1), pressed enough to stay so everywhere.
+            # p = K (1/J - 1), with a mean that keeps p positive everywhere.
             deformation=f"1 / (1 + ({PRESSURE!r} + 0.25 * (cos(2 * pi * X) + cos(2 * pi * Y))) / {modulus!r})",
             sampling="jittered",
         )
@@ -85,7 +85,7 @@ class TaylorGreen(Case):
     def measure(self, n: int, scene: Scene, frames: Frames) -> dict[str, float]:
         times, energies, steps = [], [], 0
         for frame, row in frames:
-            # Velocities are half a step old.
+            # Velocities lag positions by half a step.
             times.append(frame.time - row.step_max / 2)
             energies.append(row.kinetic)
             steps += row.steps

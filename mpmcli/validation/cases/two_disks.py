@@ -1,4 +1,4 @@
-"""Two elastic disks that meet head on, and what that conserves (Sulsky, Chen and Schreyer 1994; docs/theory.md, 10)."""
+"""Head-on collision of two elastic disks: conservation (Sulsky, Chen and Schreyer 1994; docs/theory.md, 10)."""
 
 import math
 
@@ -11,18 +11,18 @@ from mpmcli.validation.shared import ball, body, elastic, field, problem
 RADIUS, CENTRE, SPEED = 0.2, 0.3, 0.1
 DENSITY, YOUNG, POISSON = 1000.0, 1000.0, 0.3
 END, FRAMES = 3.5, 140
-# Room around the disks, so that nothing but the other disk is ever near.
+# Margin around the disks, so that they stay away from walls.
 MARGIN = 0.2
 SIZE = 1.0 + 2 * MARGIN
 CLOSING = 2 * math.sqrt(2) * SPEED
-# When circles of that radius touch, s.
+# Time at which circles of that radius touch, s.
 CONTACT = (2 * math.sqrt(2) * CENTRE - 2 * RADIUS) / CLOSING
-# The part of their speed of approach that disks have lost when contact counts as begun.
+# Relative loss of the speed of approach that marks the onset of contact.
 ONSET = 1e-3
 
 
 class TwoDisks(Case):
-    """Disks of radius 0.2 at (0.2, 0.2) and (0.8, 0.8), which fly at each other with 0.1 (1, 1) and -0.1 (1, 1)."""
+    """Disks of radius 0.2 at (0.2, 0.2) and (0.8, 0.8), with velocities 0.1 (1, 1) and -0.1 (1, 1)."""
 
     text = case_text("two_disks")
     name, title, group = "two_disks", "Collision of two elastic disks", "invariants"
@@ -61,7 +61,7 @@ class TwoDisks(Case):
             approach.append(float(difference.sum() / math.sqrt(2)))
             times.append(frame.time)
             P = np.array(row.linear_momentum)
-            # From the origin of the domain to the centre of all.
+            # From the origin of the domain to the centre of mass.
             r = centre - np.array(scene.domain.origin)
             linear = max(linear, float(np.abs(P).max()) / momentum)
             about = row.angular_momentum[0] - (r[0] * P[1] - r[1] * P[0])
@@ -80,7 +80,7 @@ class TwoDisks(Case):
 
 
 def _onset(times: list[float], approach: list[float]) -> float:
-    """Return when the speed of approach has fallen by ONSET, s; infinity if it never does."""
+    """Return the time at which the speed of approach has fallen by ONSET, s; infinity if it never does."""
     lost = 1 - np.array(approach) / approach[0]
     if not (lost > ONSET).any():
         return math.inf
@@ -90,7 +90,7 @@ def _onset(times: list[float], approach: list[float]) -> float:
 
 
 class TotalDisks(TwoDisks):
-    """The same on the grids of their states at rest, where particles of one push those of the other."""
+    """The same with total Lagrangian solids, where particles of one disk push those of the other."""
 
     text = case_text("two_disks_total")
     name, title = "two_disks_total", "Collision of two elastic disks, total Lagrangian"
@@ -107,7 +107,7 @@ class TotalDisks(TwoDisks):
 
 
 class SeparateDisks(TwoDisks):
-    """The same with a velocity field for each."""
+    """The same with a separate velocity field for each disk."""
 
     text = case_text("two_disks_contact")
     name, title = "two_disks_contact", "Collision of two elastic disks with velocity fields of their own"
