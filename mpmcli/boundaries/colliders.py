@@ -125,7 +125,7 @@ class Colliders:
         run: the current run.
         spacing: h, m.
         loads: loads of the material on each collider, about its pivot.
-        layered: whether some bodies meet separating colliders by their surfaces; then these colliders act here only
+        layered: whether some bodies touch separating colliders by their surfaces; then these colliders act here only
             if `own`, a number or a variable of a kernel, is 0.
         deterministic: whether the nodes of a row are summed in order; then `given` is the impulse of each node on each
             collider in a step, N s, else None.

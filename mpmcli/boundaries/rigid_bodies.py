@@ -82,7 +82,7 @@ class RigidBodies(RigidMotion):
 
     @ti.func
     def meet(self, node: ti.template(), velocity: ti.template(), mass: float):
-        """Add to the sums what a node with this velocity, m/s, and mass, kg, would give to each body."""
+        """Add to the sums the impulse that a node with this velocity, m/s, and mass, kg, would give to each body."""
         d = ti.static(self.dimension)
         x, v = self.colliders.place_of(node), ti.Vector.zero(float, d)
         for a in ti.static(range(d)):

@@ -148,7 +148,7 @@ class RigidContact:
 
     @ti.func
     def nearest(self, run: int, b: int, own: int, arm: ti.template(), extent: ti.template(), colliders: ti.template()):
-        """Return distance, code, friction and normal of what is nearest to a point at an arm from body b's centre."""
+        """Return distance, code, friction and normal of the obstacle nearest to a point, at an arm from body b."""
         d = ti.static(self.dimension)
         x, normal = arm, ti.Vector.zero(ti.f64, d)
         for a in ti.static(range(d)):

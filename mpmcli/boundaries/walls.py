@@ -122,8 +122,8 @@ class Walls:
         first_rough: row of `impulse` of the first rough face.
         moving: velocities of the faces that move.
         moves: whether any face moves.
-        shut: depth at and below which nothing moves through a separating wall that does not act, a number or a variable
-            of a kernel: 0, or -REACH where bodies meet the wall by their surfaces (`contact.obstacles`).
+        shut: depth at and below which velocities out through a separating wall that does not act are zero, a number or
+            a variable of a kernel: 0, or -REACH where bodies touch the wall by their surfaces (`contact.obstacles`).
     """
 
     def __init__(
@@ -176,7 +176,7 @@ class Walls:
         """Return the velocity of a node after the walls have acted.
 
         On an acting wall the normal component is zero, and the tangential one is that of the wall if it sticks. On and
-        behind a separating wall that does not act, nothing moves through it, see `shut`.
+        behind a separating wall that does not act, the velocity out through it is zero, see `shut`.
         """
         result = velocity
         if self.distance(node) <= 0:

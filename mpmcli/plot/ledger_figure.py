@@ -157,7 +157,7 @@ def _first(values: np.ndarray) -> int:
 
 
 class Panel:
-    """Axes with the times (T,), s, of the values along x; colours are given by index, None is that of the text."""
+    """Axes with the times (T,), s, of the values along x; colours are given by index, None is that of text."""
 
     def __init__(self, axes: "Axes", times: np.ndarray, theme: Theme) -> None:
         self.axes, self._times, self._theme = axes, times, theme
