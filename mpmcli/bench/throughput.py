@@ -72,16 +72,17 @@ def sand_sweep(directory: Path, count: int, frames: int = FRAMES) -> Sweep:
 def run_throughput(
     workers: int, seconds: float, blocks: int, tell: Callable[[str], None], *, frames: int = FRAMES
 ) -> dict:
-    """Compute sweeps with one worker and with all in turn, mpm88 between, and return the record for JSON.
+    """Run a sweep with one worker and one with all workers, alternately, and return a record for JSON.
 
-    A block takes about `seconds` s. Raises RunError if the peer or a sweep fails.
+    This is repeated `blocks` times; mpm88 is measured before each repetition. A sweep takes about `seconds` s. `tell`
+    receives progress messages. RunError: mpm88 or a sweep failed.
     """
     found: dict[int, list[SweepState]] = {count: [] for count in sorted({1, workers})}
     with closing(Side("mpm88", partial(Peer, CASES[0], PEER_THREADS), by_processor=False)) as peer:
         peer.measure(0.3)
         peer.blocks.clear()
         tell(f"first block, not measured: {WARM_UP} trajectories")
-        # Compiles the kernels of the sweep; the time of a trajectory excludes the first.
+        # This sweep compiles the kernels. The time of a trajectory is measured from the end of the first one.
         ends: list[tuple[int, float]] = []
         _block(1, WARM_UP, frames, lambda state: ends.append((state.done, state.seconds)))
         (first, begin), (last, end) = ends[0], ends[-1]

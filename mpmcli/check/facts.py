@@ -138,10 +138,10 @@ class SceneFacts:
 
 
 def arrivals(scene: Scene, fastest: float = 0.0, *, pressed: bool = False) -> list[Arrival]:
-    """Return the arrival of each body's bounding box, by velocities, gravity, walls, and bodies and their images.
+    """Return, for each body, the contacts of its bounding box with walls, other bodies and their periodic images.
 
-    All have the same acceleration; rotation and deformation are ignored. If forces act, gravity or a velocity is an
-    expression, or bodies start deformed (`pressed`), all arrive at time 0 at the speed `fastest`, m/s.
+    They follow from the velocities and from gravity; rotation and deformation are ignored. If forces act, gravity or a
+    velocity is an expression, or bodies start deformed (`pressed`), all arrive at time 0 at the speed `fastest`, m/s.
     """
     domain = scene.domain
     if not scene.bodies:

@@ -194,9 +194,10 @@ def damped_step(facts: SceneFacts, body: BodyFacts, step: float, shorter: float 
 
 
 def wave_loss(thickness: float, spacing: float, step: float, settings: SolverSettings) -> float:
-    """Return the fraction of energy per second that the longest wave across a body loses at a step (s), 1/s.
+    """Return the rate, 1/s, at which the longest wave across a body loses energy, relative to its energy.
 
-    Its wave number is k = pi / thickness. A step of a body's own length is damped (docs/theory.md, 2.4).
+    Its wave number is k = pi / thickness. `step`, s, is the step that determines the damping, see `damped_step`: the
+    loss in one such step does not depend on its length (docs/theory.md, 2.4).
     """
     return loss_per_step(settings, math.pi * spacing / thickness) / step
 

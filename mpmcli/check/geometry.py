@@ -43,10 +43,11 @@ def touched_walls(scene: Scene, form: Box) -> list[tuple[str, str]]:
 
 
 def thickness(form: Form, endless: Collection[int] = ()) -> float:
-    """Return the diameter of the largest ball that fits into a shape, m: its smallest extent if it is convex.
+    """Return the diameter of the largest ball that fits into a shape, m.
 
-    The accuracy for a mesh is a few cells of a grid of 48. Overlapping parts of a union are measured separately, points
-    by their bounding box. The axes in `endless` are ignored for a box, unless all axes are in it.
+    For a mesh the error is up to a few cells of a grid with 48 cells along its longest axis. Of overlapping parts of a
+    union the thickest one counts. Points have the smallest extent of their bounding box plus the edge of a particle.
+    For a box the axes in `endless` are ignored; if these are all axes, its longest edge is returned.
     """
     if isinstance(form, Ball | Capsule):
         return 2 * form.radius

@@ -240,10 +240,10 @@ def generator(seed: int, number: int, key: str) -> np.random.Generator:
 
 
 def joint_point(method: Method, seed: int, number: int, dimension: int, count: int) -> list[float]:
-    """Return the point of a trajectory in the unit cube of all continuous components of a sweep.
+    """Return one number in [0, 1) for each of the `dimension` continuous components of a trajectory's values.
 
-    It is point `number` of the scrambled Sobol sequence (A. B. Owen 1998), which does not depend on the count, or row
-    `number` of a Latin hypercube of `count` points. The seed is that of the scrambling, or of the hypercube.
+    With "sobol" it is point `number` of a Sobol sequence scrambled with the seed (A. B. Owen 1998), which does not
+    depend on the count; with "latin" it is row `number` of a Latin hypercube of `count` points drawn with the seed.
     """
     if method == "latin":
         return _latin_hypercube(seed, dimension, count)[number].tolist()
@@ -459,5 +459,5 @@ class TrajectoryValues:
         return distribution.value(self.generator(stream).random(distribution.components).tolist())
 
     def generator(self, stream: str) -> np.random.Generator:
-        """Return the random numbers of a stream of this trajectory."""
+        """Return the random number generator of a stream of this trajectory."""
         return generator(self.sweep.seed, self.number, stream)

@@ -148,10 +148,11 @@ def largest_file() -> int | None:
 def require_free_space(
     directory: Path, size: int, purpose: str, kept: str, *, joined: int = 0, several: bool = False
 ) -> None:
-    """Raise DiskFullError if the disk has no space for `size` bytes, in one file or in `several`.
+    """Raise DiskFullError unless the disk has space for `size` bytes and a margin, and a file may be that large.
 
-    `purpose` is the subject of the error's sentence ("frame 7"), `kept` its end ("the 7 frames before it are kept");
-    `joined` are the bytes of one further file that later combines this data with earlier data.
+    `several` states that the data is split into files, so that the limit on the size of a file is not compared with
+    `size`. `purpose` is the subject of the error message ("frame 7"), `kept` its end ("the 7 frames before it are
+    kept"). `joined` is the size, bytes, of one further file that later combines this data with earlier data.
     """
     included = "a margin and the packing of all frames up to it" if joined else "a margin"
     free, largest = shutil.disk_usage(directory).free, largest_file()

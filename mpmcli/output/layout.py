@@ -170,11 +170,11 @@ def _named_arrays(frame: Frame) -> Iterator[tuple[str, np.ndarray]]:
 
 @dataclass(frozen=True)
 class FrameIndex:
-    """Tables of T frames.
+    """Where T frames are stored, and what is known of each without reading its particles.
 
     Attributes:
         layout: the arrays of every frame.
-        header: facts about the run.
+        header: metadata of the run.
         times: (T,) float64, s.
         frames, steps: (T,) frame number, and time steps since the start.
         offsets, counts: (T,) first row and number of rows of each frame in its file.

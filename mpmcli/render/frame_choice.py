@@ -12,9 +12,10 @@ HINT = "give a number, first, last, all, or A:B:S, from A up to but not B in ste
 
 
 def choose_frames(text: str, result: Result) -> list[int]:
-    """Return the indices in the result of the frames selected by a text, in order.
+    """Return the indices in the result of the frames selected by a text, in the selected order.
 
-    The text is N, "first", "last", "all" or "A:B:S"; a negative number counts from the end.
+    The text is "first", "last", "all", N or "A:B:S". N is a frame number; a negative one counts back from the last
+    number (-1). A:B:S is a Python slice of the frames of the result, by position.
     """
     count = result.frame_count
     numbers = result.numbers.tolist()

@@ -36,9 +36,13 @@ class Drive:
 
 @dataclass(frozen=True)
 class Slices:
-    """Lengths of parts of a run, (n,), s, that resolve every pulse; sample times, (m,), s; the part of each, (m,).
+    """Division of a run into parts that resolve every pulse, with sample times.
 
-    The times are the middle of each part, and the time at which the terms that depend on time alone are largest in it.
+    Attributes:
+        lengths: of the parts, (n,), s.
+        times: (m,), s: the middle of each part, the times of the largest and smallest values of terms that depend on
+            time alone, and the start and the end of the run.
+        part: index of the part of each time, (m,).
     """
 
     lengths: np.ndarray

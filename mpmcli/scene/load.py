@@ -265,9 +265,10 @@ def read_scene(path: str | PathLike[str], seen: Sequence[File] = ()) -> tuple[st
 
 
 def merged(base: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
-    """Return a table with changes: tables are merged, entries of lists by their names; all else is replaced.
+    """Return a table with changes: tables are merged, as are list entries of the same name; other entries are appended.
 
-    A shape, and a material with a preset or a law of its own, replace those of the base.
+    Any other value is replaced, as is a shape, and a material for which the changes give a preset or a law. `cells` and
+    `spacing` replace each other.
     """
     result = dict(base)
     for key, value in changes.items():

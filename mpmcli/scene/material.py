@@ -14,7 +14,7 @@ from mpmcli.scene.quantity import Positive
 
 @dataclass(frozen=True)
 class Knob:
-    """A word and a position from 0 to 1 that set one parameter of a law.
+    """A named key of a scene, from 0 to 1, that sets one parameter of a law.
 
     It belongs to the metadata of that parameter:
     `viscosity: Annotated[NotNegative, Knob("thickness", 1e-3, 1e2, "...")] = Field(0.0, description=...)`.
@@ -25,7 +25,7 @@ class Knob:
         high: value at position 1; below `low` where the word means less of the parameter.
         meaning: description of some positions, a sentence without its full stop.
         scale: equal steps of a logarithmic knob multiply the parameter; those of a linear one add to it.
-        excludes: further parameters that fix the same quantity; the knob is refused beside them.
+        excludes: other parameters that set the same quantity; it is an error to give one of them with the knob.
     """
 
     name: str

@@ -86,7 +86,7 @@ def _covered(places: np.ndarray, counts: np.ndarray) -> np.ndarray:
 
 
 def first_come(pairs: np.ndarray, n: int) -> np.ndarray:
-    """Return which of n points stay, (n,) bool, if each in turn is refused for one that stays before it.
+    """Return which of n points stay, (n,) bool: in order, each stays unless it is too close to one that stays.
 
     `pairs`, (k, 2), are the numbers of points that are too close to each other, the smaller one first.
     """
@@ -157,10 +157,10 @@ def initial_deformation(body: Body, position: np.ndarray, domain: Domain) -> np.
 
 
 def hydrostatic_load(body: Body, position: np.ndarray, domain: Domain) -> np.ndarray:
-    """Return density g depth, (n,), Pa, the depth below the top of the bounding box of the body, against gravity.
+    """Return density times g times depth, (n,), Pa; depth is measured along gravity from the top of the bounding box.
 
-    Particles start evenly spaced, with the mass of their volume at rest, and their force is J p times that volume:
-    therefore J p must carry their weight.
+    It is the value of J p: particles start evenly spaced with the mass of their volume at rest, V0, and the force of
+    their stress is proportional to V0 J p.
     """
     gravity = domain.gravity_at(0.0)
     lower, upper = body.shape.form.bounds()

@@ -146,7 +146,7 @@ class BodyContact:
         dt: float,
         gravity_step: ti.template(),
     ):
-        """Exchange momentum between bodies, and then with obstacles, at rows of nodes of the box.
+        """Exchange momentum between bodies, then with obstacles, at rows `first` to `after` - 1 of the contact box.
 
         `dt` is the step, s; `gravity_step` is the change of velocity by gravity in the step, m/s.
         """

@@ -282,9 +282,10 @@ class BodySurfaces:
 
     @ti.func
     def find_box(self, grid: ti.template(), obstacles: ti.template(), w: int, drift: int, last: ti.template()):
-        """Find the nodes used by layers and the box of possible contact, `drift` cells after the sort; free all slots.
+        """Compute the nodes used by each layer and the box of possible contact; release all slots.
 
-        The box includes the first nodes of the stencils of all particles in contact there.
+        Particles have moved by up to `drift` cells since the sort. The box also includes the first stencil node of
+        every particle whose stencil reaches a node of possible contact.
         """
         d, reach, begin = ti.static((self.dimension, grid.scheme.spline.nodes - 1, w * self.layers))
         self.drift[w] = drift

@@ -110,7 +110,7 @@ class Period:
             after = inside
             lost += taken
             low = 0.0
-        # Written so that a NaN is lost.
+        # In this form the condition also reports a NaN as lost.
         out = 1.0
         if after >= low and after <= extent - low:
             out = 0.0

@@ -27,13 +27,13 @@ from mpmcli.solver.transfer.splines import PAD, SPLINES
 
 @ti.data_oriented
 class BlockNodes(LinearNodes):
-    """Nodes stored tile by tile.
+    """Nodes of a sparse grid, in blocks: one for each tile that particles can reach until the next sort.
 
     Attributes:
         tile: edge of a tile, nodes.
         tiles: number of tiles per axis.
         block: nodes per tile.
-        table: (tiles of the domain) int, the number of each tile.
+        table: (all tiles) int, the index of the block of each tile; 0, a block of zeros, if particles do not reach it.
     """
 
     sparse = True

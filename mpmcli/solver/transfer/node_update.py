@@ -64,7 +64,7 @@ class NodeUpdate:
         value = self.grid.part(index, 0)
         pull = gravity_step
         speed_squared = 0.0
-        # Computed once: the code that depends on them is most of this loop.
+        # Computed once for all uses below, because the code that depends on these values is most of this loop.
         depth, mirror, upper = ti.Vector([REACH + 1] * d), node, ti.Vector.zero(int, d)
         acts, holds = ti.Vector.zero(int, d), ti.Vector.zero(int, d)
         place = ti.static((depth, mirror, upper, acts, holds))
@@ -118,8 +118,8 @@ class NodeUpdate:
     def update_before(self, node: ti.template(), index: int, kind: int, place: ti.template()):
         """Convert the momentum before stress and forces to velocity: fold and unfold without boundary conditions.
 
-        Momentum and mass are weighted by the fraction of its motion that each body keeps. Bodies in contact therefore
-        do not exchange momentum, whatever their fractions are.
+        Momentum and mass are weighted by the fraction of its motion that each body keeps. The kept motion therefore
+        transfers no momentum between bodies in contact, even if their fractions differ.
 
         Mirror images have this velocity too, so that a wall changes only the contribution of stress; friction acts on
         the change of velocity.

@@ -278,10 +278,10 @@ def centred(grid: ti.template(), distance: ti.template(), velocity: ti.template(
 
 @ti.func
 def turned(grid: ti.template(), gained: ti.template(), v: ti.template(), C: ti.template(), H: ti.template(), dt: float):
-    """Return the change of C by which kept velocity v and affine velocity C conserve angular momentum.
+    """Return the change of affine velocity that conserves angular momentum if a particle keeps v and affine part C.
 
-    It is dt (g v^T - v g^T) / (2 D) + dt (C H^T - H C^T) / 2, where g is the change of the nodal velocity without
-    gravity and H the gradient of the nodal velocity of the kept motion (docs/theory.md, 2.3).
+    It is dt (g v^T - v g^T) / (2 D) + dt (C H^T - H C^T) / 2. Here g is `gained`, the change of the gathered velocity
+    without that by gravity, and H the gradient of the nodal velocity of the kept motion (docs/theory.md, 2.3).
     """
     d = ti.static(grid.dimension)
     result, scale = ti.Matrix.zero(float, d, d), 0.5 * dt * grid.gradient_scale * grid.inverse_spacing

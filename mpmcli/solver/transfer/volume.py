@@ -344,10 +344,10 @@ def held_beside(x: ti.template(), grid: ti.template(), last: ti.template()):
 
 @ti.func
 def mirrored_sum(node: ti.template(), grid: ti.template(), last: ti.template(), reach: ti.template()):
-    """Return the mass or volume of a node plus its images beyond walls and periodic faces.
+    """Return the sum of the mass or volume of a node and of its images beyond walls and periodic faces.
 
-    A node on a wall, whose cell is half outside, counts twice. All walls mirror here, including separating walls and
-    walls that set velocities to zero.
+    A node on a wall, whose cell is half outside, counts twice, at an edge or corner of walls 4 or 8 times. All walls
+    have images here, whatever their condition. `reach` is the number of nodes inside a wall that have images.
     """
     d = ti.static(grid.dimension)
     total = 0.0
