@@ -192,10 +192,11 @@ class MirrorImages:
     def mirrored_value(
         self, value: ti.template(), images: int, holds: ti.template(), upper: ti.template(), mass: float
     ):
-        """Return mirrored momentum or velocity (mass 1): the normal part always, the rest if the wall sticks.
+        """Return a mirrored momentum, or with mass 1 a mirrored velocity: reflected about the velocity of the wall.
 
-        This is a reflection about the velocity of the wall. At an edge two reflections restore the sign, and the terms
-        of walls of equal velocity cancel; if they differ, the velocity is discontinuous there with any image.
+        The component normal to the wall is always reflected, the others only if the wall sticks. At an edge, two
+        reflections of a component cancel if both walls have the same velocity; otherwise the velocity is discontinuous
+        there for any choice of image.
         """
         result = value
         for i, a in ti.static(enumerate(self.walls.axes)):

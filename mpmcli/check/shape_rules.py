@@ -285,10 +285,10 @@ def _room(facts: SceneFacts) -> Iterator[Finding]:
 
 
 def _rooms(scene: Scene) -> Iterator[tuple[float, float, float, str]]:
-    """Yield (room over volume, time, volume, names of bodies) at instants, for the matter in each initial room.
+    """Yield (room / volume, time, volume, names) for the bodies in each initial room, at several times.
 
-    A room is a connected part of the domain outside colliders. Matter stays in the parts that overlap its room from one
-    instant to the next.
+    A room is a connected part of the domain outside colliders. At each time, the bodies' room becomes the union of the
+    connected parts that overlap their room at the time before; `volume` is that of the bodies, m^d.
     """
     from scipy.ndimage import label
 

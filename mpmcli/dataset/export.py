@@ -32,10 +32,17 @@ _OURS = re.compile(r"metadata\.json|checksums\.sha256|(train|valid|test)\.(h5|np
 
 @dataclass(frozen=True)
 class ExportSettings:
-    """Settings of an export: format, selection and target.
+    """Settings of an export.
 
-    `form` is a key of FORMATS; an earlier export is replaced only with `overwrite`; None exports every trajectory, or
-    all particles. `wall_spacing` is the distance of particles on walls, m, None for that of the others.
+    Attributes:
+        form: format, a key of FORMATS.
+        directory: target.
+        trajectory: number of the only trajectory to export; None for all.
+        stride: export every `stride`-th frame.
+        max_particles: largest number of material particles per trajectory; None for all.
+        overwrite: whether an earlier export in `directory` is replaced.
+        walls: walls that get particles.
+        wall_spacing: distance between neighbouring wall particles, m; None for that of the material at the start.
     """
 
     form: str

@@ -253,9 +253,9 @@ def source_digests(sweep: Sweep, plugins: Sequence[Path]) -> dict[str, str]:
 
 
 def copied_files(names: Iterable[str]) -> list[str]:
-    """Return the names of `source_files` that a dataset copies, to the same places relative to its base.
+    """Return the names of `source_files` that a dataset copies, to the same paths relative to its base scene.
 
-    Files with absolute names, files outside the directory of the base, and plugins are not copied.
+    Plugins are not copied, nor files whose name is absolute or has a part that is ".." or in OWN.
     """
     found = [name for name in names if not name.startswith(PLUGIN)]
     return [name for name in found if not Path(name).is_absolute() and not {"..", *OWN} & {*Path(name).parts}]

@@ -212,7 +212,7 @@ class Law(ABC):
             deformation: J, or F as a d x d matrix, after the deformation of the last step.
             internal: vector of the internal variables in their order; a single unused 0 if there are none.
             C: velocity gradient, d x d, 1/s.
-            dt: the step, s; read only by rate-dependent laws.
+            dt: time over which plastic flow is integrated, s, the `kick` of a step; read only by rate-dependent laws.
             constants: vector of the values that `constants` returned.
 
         Returns:

@@ -143,10 +143,11 @@ class Sand(HenckyLaw):
     2D, and in 3D under plane strain. (The alpha of Klar et al. matches triaxial compression; in plane strain it never
     yields for phi >= 42.2 degrees. The angle in triaxial compression is asin(3 sin(phi) / (2 sqrt(3) + sin(phi))).)
     Plastic shear keeps tr e and causes no dilation. Beyond the tip of the cone, at a tension of c cot(phi), the grains
-    separate: the strain returns to the tip, and the difference is added to the plastic volume strain v. Compression
-    first reduces v and causes pressure only at v = 0 (after Tampubolon et al. 2017). Therefore ln J = tr e + v, where J
-    is the total volume ratio; v is at most 2, and follows the density of the grid (docs/theory.md, 5.11). In 2D the
-    out-of-plane stress is the mean of the in-plane principal stresses, which plastic flow in plane strain approaches.
+    separate: the strain is projected to the tip, and the difference is added to the plastic volume strain v, at most 2.
+    ln J = tr e + v, where J is the total volume ratio. With `volume_correction`, compression first reduces v and causes
+    pressure only at v = 0 (after Tampubolon et al. 2017), and v is relaxed towards the density of the grid
+    (docs/theory.md, 5.11). In 2D the out-of-plane stress is the mean of the in-plane principal stresses, which plastic
+    flow in plane strain approaches.
     """
 
     name = "sand"
@@ -213,7 +214,7 @@ class Sand(HenckyLaw):
         time: float,
         constants: ti.template(),
     ):
-        """Move v towards the value on the grid, by the change of J = det F exp v. A lack, v < 0, is ignored."""
+        """Move v so that J = det F exp(v) approaches `seen`; v stays between 0 and SCATTERED."""
         v = internal
         if constants[CORRECTION] > 0.0:
             J = deformation.determinant()

@@ -163,7 +163,7 @@ def _stretches_2d(F: ti.template()):
 
 @ti.func
 def _rotation(d: float, e: float, weight: float):
-    """Return (r, cos, sin): of [[a, c], [c, b]], the distance of its eigenvalues, and its larger eigenvector.
+    """Return (r, cos, sin) of [[a, c], [c, b]]: the difference r of its eigenvalues, and the eigenvector of the larger.
 
     d and e are a - b and 2 c; the weight is 1 over the square of the length of the eigenvector.
     """

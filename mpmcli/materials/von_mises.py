@@ -65,8 +65,8 @@ class VonMises(HenckyLaw):
     """J2 plasticity in Hencky strain with linear isotropic hardening: sqrt(3/2) |dev tau| <= yield_stress + H a.
 
     a is the equivalent plastic strain. The return mapping is radial and exact for linear hardening (Simo 1992; de Souza
-    Neto, Peric and Owen 2008, box 7.5; docs/theory.md, 5.8), and keeps the volume. 2D is plane strain: elastic strain
-    along z balances plastic flow along z, and the particle stores it beside the in-plane elastic F.
+    Neto, Peric and Owen 2008, box 7.5; docs/theory.md, 5.8), and keeps the volume. 2D is plane strain: the elastic
+    strain along z is minus the plastic strain along z, and is stored in addition to the in-plane elastic F.
     """
 
     name = "von_mises"

@@ -72,7 +72,7 @@ def reconstruct(
         return empty_mesh(carried)
     points, source = with_images(particles, IMAGE_REACH, low, high)
     length, threshold, rounds = CLOSE if close else USUAL
-    # Its own clean-up and smoothing depend on the order of threads; ours follow after sorting.
+    # The pipeline's own clean-up and smoothing depend on the order of threads; both are done below, after sorting.
     surface, _ = reconstruction_pipeline(
         points,
         attributes_to_interpolate={name: np.ascontiguousarray(values[source]) for name, values in carried.items()},
@@ -94,7 +94,7 @@ def reconstruct(
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
     triangles = rank[faces.astype(np.int64)]
-    # The lowest vertex of each comes first, and they are sorted.
+    # Rotate each triangle so that its lowest vertex comes first, and sort the triangles.
     turn = triangles.argmin(axis=1)[:, None]
     triangles = np.take_along_axis(triangles, (turn + np.arange(3)) % 3, axis=1)
     triangles = triangles[np.argsort(triangles[:, 0] * len(order) + triangles[:, 1], kind="stable")]
@@ -102,7 +102,7 @@ def reconstruct(
     vertices[:], faces[:] = vertices[order], triangles
     weights, connectivity = _fullness(points, vertices), mesh.vertex_vertex_connectivity()
     laplacian_smoothing_parallel(mesh, connectivity, iterations=rounds, beta=1.0, weights=weights)
-    # The old view is stale: smoothing has replaced its memory.
+    # Smoothing has reallocated the vertices, so that the earlier view is no longer valid.
     raw = np.asarray(mesh.vertices)
     vertices = np.clip(raw, low, high)
     kept = _area_vectors(vertices, triangles).any(axis=1)

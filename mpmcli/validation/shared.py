@@ -90,9 +90,10 @@ def free_blocks(n: int, edge: float, count: int, gaps: Sequence[int]) -> tuple[T
 def smooth_ramp(duration: float) -> str:
     """Return the text of an expression of t that rises from 0 to 1 within `duration`, s, and stays there.
 
-    s^4 (35 - 84 s + 70 s^2 - 20 s^3), s = t / duration. Three derivatives vanish at both ends. The remaining
-    oscillation of a mode of frequency w is at most 1680 / (w duration)^4 of its static part (integration by parts of
-    the slope 140 s^3 (1 - s)^3, whose third derivative is 840 at both ends).
+    With x = t / duration it is x^4 (35 - 84 x + 70 x^2 - 20 x^3), whose first three derivatives vanish at both ends. A
+    mode of angular frequency w then oscillates with at most 2000 / (w duration)^4 of its static displacement, and about
+    1680 / (w duration)^4 if w duration is large: integrate the slope 140 x^3 (1 - x)^3, whose third derivative at the
+    ends is 840 and -840, by parts.
     """
     s = f"clamp(t / {duration!r}, 0, 1)"
     return f"({s} ** 4 * (35 - 84 * {s} + 70 * {s} ** 2 - 20 * {s} ** 3))"

@@ -199,7 +199,7 @@ class Run:
     # The time step.
 
     def limits(self) -> list[Limit]:
-        """Return all bounds on the next step: for the current speed, and otherwise from the last measurement."""
+        """Return all bounds on the next step: that of the speed for the current state, others as last measured."""
         state, limits = self.state, self._control.limits()
         value = min(min(limit.value for limit in limits), state.held)
         limits.append(Limit(self.batch.steps.speed_limit(state, value), "speed", ""))
@@ -236,11 +236,11 @@ class Run:
     def frames(self, stop: Callable[[], bool] = lambda: False) -> Iterator[tuple[Frame, LedgerRow]]:
         """Yield the current state and then one frame for each later output time, with its ledger row.
 
-        The time to the next frame is divided into equal steps, so that frames are exactly at their times. After `load`
-        of a state saved between frames, only later frames are yielded.
+        Each step is the time left to the next frame divided by a whole number, so that frames are exactly at their
+        times. After `load` of a state saved between frames, only later frames are yielded.
 
         Args:
-            stop: called before each launch except the first; it may call `save`. If it returns True, the run ends.
+            stop: called before each launch, except that which measures the initial state; it may call `save`.
 
         Raises:
             UnstableRunError: a particle left the domain, was inverted or became non-finite.
@@ -248,7 +248,7 @@ class Run:
         """
         yield from self.begin_frames()
         while not self.ended:
-            # Frame 0 always exists, and the frames recorded in a launch are yielded before.
+            # Here frame 0 and all frames recorded so far have been yielded.
             if self._begun and stop():
                 raise KeyboardInterrupt
             self.before_launch()
@@ -530,7 +530,7 @@ class Run:
     # Saved states.
 
     def save(self) -> SavedState:
-        """Return the state of the only run of a batch, when `stop` of `frames` is called or between steps.
+        """Return the state of a run alone in its batch; call it from `stop` of `frames` or between steps.
 
         Its arrays are copied from the device one by one when accessed, and are valid until the next step.
         """
@@ -576,7 +576,7 @@ class Run:
             self.grid.fixed.forget(self.slot)
 
     def lost(self) -> list[int | None]:
-        """Return a lost particle of each group, in solver order, or None."""
+        """Return the solver index of a lost particle of each group, or None for a group without one."""
         count = len(self.groups)
         found = self.batch.device.particles.lost.to_numpy()[self.slot * count :][:count]
         if self.grid.deterministic:

@@ -8,11 +8,11 @@
     show the particles at an output time                  frames.reader
     measure the state if its bounds may have changed      step_size.StepControl
 
-`cpu_launch.CpuLaunch.lead` does this inside one launch until the host is needed. `gpu_launch.GpuLaunch.step` takes
-steps, and the host does the rest between launches. `run.Run` starts launches and yields frames.
+`cpu_launch.CpuLaunch.advance_run` does this inside one launch until the host is needed. `gpu_launch.GpuLaunch.step`
+takes steps, and the host does the rest between launches. `run.Run` starts launches and yields frames.
 
-The body of a phase is a function of one node or particle, `Phase.body`, or the method with the name of the phase: of
-`CpuPhases` for a part of the nodes or particles, and of `GpuPhases` for a single one.
+The body of a phase is `Phase.body`, a function of one node or particle, or else the method with the name of the phase.
+The method of `GpuPhases` processes one item, such as a node or a particle; that of `CpuPhases` a part of all items.
 """
 
 from collections.abc import Callable, Sequence
@@ -29,7 +29,7 @@ from mpmcli.solver.transfer import redistribution as by
 class Phase:
     """A loop of a step; the next phase starts when it is finished.
 
-    Phases that shift particles precede all others, in steps that relax volumes.
+    In steps that relax volumes, the phases that shift particles come first; other steps omit them.
 
     Attributes:
         name: name of the phase and of its body.
@@ -74,13 +74,13 @@ def step_phases(
 
     Args:
         laws: the laws, one per group.
-        uses_f_bar: whether the particles of each law share their change of volume.
-        contact: whether any wall separates.
+        uses_f_bar: for each law, whether the changes of volume of its particles are averaged over cells.
+        contact: whether material can separate from any wall.
         friction: whether any wall has friction.
         deterministic: whether P2G is in fixed point.
         loads: whether loads on colliders are summed in a phase of their own.
         shifts: the dimension if particles are shifted, else 0.
-        separates: whether bodies are in contact by their surfaces.
+        separates: whether bodies have velocity fields of their own, with contact at their surfaces.
         serial: whether one thread lists surface particles, as on a CPU.
         rigid: whether any collider moves freely.
     """

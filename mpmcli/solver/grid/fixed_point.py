@@ -102,7 +102,7 @@ class FixedPoint:
         reach: cells from the middle node of a stencil to its farthest node.
         run: number of the run of a view.
         scales: scales of each run, see OF_MASS.
-        pace: scale of momenta of each run, its inverse, and the largest speed that fits the sums, m/s.
+        pace: for each run the scale of momenta, its inverse, and the largest speed for which no sum overflows, m/s.
         beyond: per run, the smallest id of a particle that is too fast for the sums, and the smallest index of a node
             that is too heavy; NOTHING if there is none.
     """
@@ -159,7 +159,7 @@ class FixedPoint:
             self.beyond[2 * run + k] = NOTHING
 
     def found_beyond(self, run: int) -> tuple[int | None, int | None]:
-        """Return the id of a particle and the index of a node that exceeded the sums, or None."""
+        """Return the id of a particle that is too fast and the index of a node that is too heavy, or None."""
         particle, node = self.beyond.to_numpy()[2 * run : 2 * run + 2].tolist()
         return None if particle == NOTHING else particle, None if node == NOTHING else node - run * self._node_count
 
@@ -170,7 +170,7 @@ class FixedPoint:
 
     @ti.func
     def scaled(self, mass: float, middle: ti.template(), change: ti.template()):
-        """Scale the contribution of a particle to its stencil (see `momentum`); return whether it fits the sums."""
+        """Scale the contribution of a particle to its stencil (see `momentum`); return whether no sum can overflow."""
         d = ti.static(self.dimension)
         scale, most = self.pace[self.run][0], mass * self.pace[self.run][2]
         fits = True

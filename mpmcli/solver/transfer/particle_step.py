@@ -61,7 +61,7 @@ class Loads:
 
 @dataclass(frozen=True)
 class Receiver:
-    """A particle before G2P: variables of a kernel.
+    """State of a particle before G2P; all attributes are variables of a kernel.
 
     Attributes:
         place: position in the domain, m.
@@ -121,17 +121,19 @@ def loads_on(particles: ti.template(), g: ti.template(), group: ti.template(), p
 
 @ti.func
 def hand_over(particles: ti.template(), group: ti.template(), own: ti.template(), distance: ti.template(), kick: float):
-    """Return the contribution of a particle, a `Sender`, to its nodes, and the change of its state.
+    """Return the contribution of a particle, a `Sender`, to its nodes, and its plastic flow.
 
-    Node i receives w_i (m v + A (x_i - x_p)) with A = m C - dt V0 tau / D (Hu et al. 2018, eq. 18), and w_i m.
+    Node i receives the momentum w_i (m v + A (x_i - x_p)), A = m C - kick V0 tau / D (Hu et al. 2018, eq. 18), and the
+    mass w_i m. v and C include the external loads over `kick`.
 
     Args:
-        distance: distance from the first node of its stencil, cells.
+        distance: position relative to the first node of its stencil, (d,), cells.
         kick: time for which stress and forces act, s.
 
     Returns:
-        middle, change: momentum and mass at the middle node, and their change per cell and axis, see `momentum`.
-        plastic, inner: the change of J or F by the projection of the law, and the internal variables after it.
+        middle, change: momentum and mass at the middle node, and their change per cell along each axis, see `momentum`.
+        plastic, inner: for a law that `projects`, the change of J or F by plastic flow, and the internal variables
+            after it; unused for other laws.
     """
     grid, d = ti.static((particles.grid, group.dimension))
     seen, stretch = own.state, 1.0
