@@ -172,21 +172,6 @@ class Walls:
         return walls
 
     @ti.func
-    def constrain(self, node: ti.template(), velocity: ti.template()):
-        """Return the velocity of a node after the walls have acted.
-
-        On an acting wall the normal component is zero, and the tangential one is that of the wall if it sticks. On and
-        behind a separating wall that does not act, the velocity out through it is zero, see `shut`.
-        """
-        result = velocity
-        if self.distance(node) <= 0:
-            depth, mirror, upper = self.place(node)
-            acts = self.acting(node, depth, mirror, upper)
-            holds = self.holding(node, depth, upper, True)
-            result = self.constrained(result, depth, upper, acts, holds)
-        return result
-
-    @ti.func
     def constrained(
         self,
         velocity: ti.template(),
@@ -195,7 +180,11 @@ class Walls:
         acts: ti.template(),
         holds: ti.template(),
     ):
-        """Return the result of `constrain` for a node with known depth, side, acting walls and sticking walls."""
+        """Return the velocity of a node after the walls have acted, from its depth, side, acting and sticking walls.
+
+        On an acting wall the normal component is zero, and the tangential one is that of the wall if it sticks. On and
+        behind a separating wall that does not act, the velocity out through it is zero, see `shut`.
+        """
         result = velocity
         for a in ti.static(self.axes):
             if acts[a] == 1 and depth[a] == 0:

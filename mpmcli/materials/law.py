@@ -211,13 +211,13 @@ class Law(ABC):
         Args:
             deformation: J, or F as a d x d matrix, after the deformation of the last step.
             internal: vector of the internal variables in their order; a single unused 0 if there are none.
-            C: velocity gradient, d x d, 1/s.
-            dt: time over which plastic flow is integrated, s, the `kick` of a step; read only by rate-dependent laws.
+            C: velocity gradient, d x d, 1/s; read by viscous laws.
+            dt: time over which plastic flow is integrated, s, the `kick` of a step; read if the flow depends on rate.
             constants: vector of the values that `constants` returned.
 
         Returns:
             Kirchhoff stress tau = J sigma, d x d, Pa; its out-of-plane component (0.0 in 3D), Pa; the deformation
-            and the internal variables, as given or projected.
+            and the internal variables, unchanged or after the return mapping.
         """
         raise NotImplementedError
 
