@@ -214,7 +214,7 @@ COLUMNS = tuple(f.name for f in fields(LedgerRow))
 # A row for each collider, pair or body.
 PER_PART = (*LOADS, *RIGID)
 VECTORS = ("linear_momentum", "angular_momentum")
-# For scenes in which particles come and go or bodies separate; otherwise None and not stored.
+# Columns that some scenes and older results lack: None, and not stored.
 OPTIONAL = ("emitted", "emitted_mass", "retired", "retired_mass", "blocked", "contact_overlap", "contact_gap")
 INTEGERS = ("steps", "emitted", "retired", "blocked")
 TEXT = "limit"

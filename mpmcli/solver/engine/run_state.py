@@ -125,7 +125,7 @@ RUN: Mapping[str, Entry] = {
     "relaxed": _real("kernel"),  # time over which volumes relax, s, 0 in most steps
     "steps_to_target": _real("kernel"),  # number of equal steps, including this one
     "deformation": _real("kernel"),  # bound by deformation, s
-    "step_limit": _int("kernel"),  # code of the bound that sets it
+    "step_limit": _int("kernel"),  # code of the smallest bound, also if the step was given or its rise is held back
     # The steps since the last frame, for the ledger.
     "smallest": _real("kernel", math.inf),  # s
     "smallest_courant": _real("kernel"),  # Courant number of the smallest step
