@@ -100,7 +100,7 @@ def test_an_unstable_run_keeps_its_frames_and_says_where_it_failed(tmp_path):
     assert summary["status"] == "unstable" and summary["frames"] == 1
     (said,) = [line for line in outcome.stderr.splitlines() if line.startswith("error: ")]
     assert said == f"error: {summary['message']}"
-    for part in ("unstable at step ", ", t = ", " s: particle ", 'body "drop" at (', ") m was ", "limit"):
+    for part in ("unstable at step ", ", t = ", " s: particle ", 'body "drop" at (', ") m collapsed", "limit"):
         assert part in said, part
     record = json.loads((tmp_path / "result" / "run.json").read_text(encoding="utf-8"))
     assert record["status"] == "unstable"
