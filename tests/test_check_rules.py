@@ -130,10 +130,12 @@ def test_bodies_that_separate_begin_where_they_like() -> None:
         ({"contact": {"default": "separate", "friction": 0.3}}, False),
         ({"domain": {"walls": {"x_min": "periodic", "x_max": "periodic"}}}, False),
         ({"solver": {"solids": "total"}}, False),
+        ({"solver": {"grid": "sparse"}}, False),
+        ({"colliders": [{"name": "raft", "shape": box([0.6, 0.6], [0.8, 0.7]), "density": 500.0}]}, False),
     ],
 )
-def test_elastic_bodies_that_stick_because_nothing_was_said(more: dict, fires: bool) -> None:
-    """Of two elastic bodies, unless the scene says what their contact is, or cannot resolve it."""
+def test_a_scene_that_does_not_set_contact(more: dict, fires: bool) -> None:
+    """Two elastic bodies get a note, unless contact is set, or bodies cannot separate in the scene."""
     low, high = block("low", [0.25, 0.0], [0.5, 0.25]), block("high", [0.25, 0.5], [0.5, 0.75])
     elastic = [one | {"material": SOLID} for one in (low, high)]
     assert [finding.severity for finding in found("contact", elastic, **more)] == ["note"] * fires

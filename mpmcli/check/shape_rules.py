@@ -88,12 +88,13 @@ def _gaps(facts: SceneFacts) -> Iterator[Finding]:
 
 
 def _sticking(facts: SceneFacts) -> Iterator[Finding]:
-    """Yield elastic bodies that stick to each other because the scene does not say what their contact is."""
+    """Yield elastic bodies that stick although they could separate, in a scene that does not set contact."""
     scene = facts.scene
     elastic = [source.name for source in scene.sources if source.has_surface]
-    asked = scene.contact.pairs or "default" in scene.contact.model_fields_set
-    periodic = any(PERIODIC in pair for pair in scene.domain.walls.faces(scene.dimension))
-    if len(elastic) > 1 and not asked and not periodic and scene.solver.solids != "total":
+    given = scene.contact.pairs or "default" in scene.contact.model_fields_set
+    shared = any(scene.domain.periodic) or any(collider.free for collider in scene.colliders)
+    shared = shared or scene.solver.solids == "total" or scene.solver.grid == "sparse"
+    if len(elastic) > 1 and not given and not shared:
         reach = REACH[scene.solver.kernel]
         what = (
             f"The elastic bodies {several(quoted(elastic))} share one velocity field: they act on each other within "

@@ -343,7 +343,7 @@ class BodyContact:
                 if alike < SAME:
                     first_axis = 0
                 else:
-                    # Not the mean of all normals, which tilts beside edges.
+                    # Not the mean of n_a and -n_c, which tilts beside edges.
                     for b in ti.static(range(d)):
                         normal[b] = axes[0, b] + axes[1, b]
                     normal = normal.normalized()
