@@ -1,7 +1,7 @@
 """Bodies with velocity fields of their own meet where their surfaces are, slide with friction, and part."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 
 import contact_reference as contact
@@ -140,7 +140,6 @@ def test_pairs_that_cannot_be_are_one_sentence(pairs: list, said: str) -> None:
         ({"solver": {"deterministic": True}}, "vulkan", "with solver.deterministic = true on a GPU"),
         ({"solver": {"solids": "total"}, "domain": {"walls": "separate"}}, "cpu", 'with solver.solids = "total"'),
         ({"solver": {"grid": "sparse"}}, "cpu", "on a sparse grid"),
-        ({"domain": {"walls": {"x_min": "periodic", "x_max": "periodic"}}}, "cpu", "in a domain with periodic walls"),
     ],
 )
 def test_what_has_one_velocity_field_is_refused(tables: dict, arch: str, reason: str) -> None:
@@ -494,3 +493,74 @@ def test_three_bodies_keep_what_they_have(backend_of: Callable) -> None:
             assert image == pytest.approx(centre, abs=1e-9)
             # At nodes of three bodies pairs come one after the other.
             assert other.position[other.body == 2 - k].mean(axis=0) == pytest.approx(centre, abs=0.08 * H)
+
+
+# Periodic walls.
+
+
+def compare(scenes: Sequence[Scene], shift: Sequence[float], backend: Backend) -> tuple[float, Frame]:
+    """Run a scene, and the same moved by `shift` cells.
+
+    Return by how many cells their particles differ, up to periods of the domain, and the last frame of the second.
+    """
+    one, other = ([frame for frame, _ in build_run(each, backend).frames()] for each in scenes)
+    size = np.array(scenes[0].domain.size)
+    away = [after.position - before.position - H * np.array(shift) for before, after in zip(one, other, strict=True)]
+    return max(np.abs(way - size * np.round(way / size)).max() for way in away) / H, other[-1]
+
+
+def discs(shift: Sequence[float], precision: str) -> Scene:
+    """Balls that meet off their centres, in a domain that is periodic along all axes."""
+    cells = np.array([64, 32, 16][: len(shift)])
+
+    def ball(name: str, centre: list[float], velocity: list[float]) -> dict:
+        place = (np.array(centre[: len(cells)]) + shift) % cells
+        shape = {"ball": {"center": list(H * place), "radius": 3 * H}}
+        return {"name": name, "shape": shape, "material": jelly(), "velocity": velocity[: len(cells)]}
+
+    both = [ball("a", [26, 13, 6.3], [0.9, 0.4, 0.1]), ball("b", [38, 20, 7.0], [-0.9, -0.6, 0.1])]
+    domain = {"size": list(H * cells), "walls": "periodic", "gravity": [0.0] * len(cells)}
+    return scene(both, 0.3, end=0.5, frames=10, domain=domain, solver={"precision": precision})
+
+
+@pytest.mark.parametrize(
+    ("arch", "precision", "shift", "error"),
+    [
+        ("cpu", "f64", (32, 16), 1e-8),
+        pytest.param("cpu", "f64", (32, 16, 5), 1e-8, marks=pytest.mark.slow),
+        pytest.param("vulkan", "f32", (32, 16), 1e-4, marks=[pytest.mark.slow, pytest.mark.gpu]),
+    ],
+)
+def test_bodies_meet_through_the_corner_of_a_periodic_domain(
+    backend_of: Callable, arch: str, precision: str, shift: tuple[int, ...], error: float
+) -> None:
+    """They do what they do in its middle, and rebound."""
+    backend = backend_of(precision, 1, arch)
+    scenes = [discs(by, precision) for by in ([0] * len(shift), shift)]
+    found, last = compare(scenes, shift, backend)
+    assert found < error
+    assert last.velocity[last.body == 0, 0].mean() == pytest.approx(-0.72, abs=0.04)
+
+
+@pytest.mark.slow
+def test_a_block_pushes_another_through_a_periodic_face(backend_of: Callable) -> None:
+    """On a rough floor, beside water."""
+
+    def pushed(shift: float) -> Scene:
+        def place(x: float) -> float:
+            return (x + shift) % 32
+
+        low = {name: place(x) for name, x in (("a", 14), ("b", 21), ("w", 27))}
+        water = {"law": "fluid", "density": DENSITY, "bulk_modulus": 2e4}
+        bodies = [
+            body("a", [low["a"], 0], [low["a"] + 6, 4], velocity=[1.5, 0.0]),
+            body("b", [low["b"], 0], [low["b"] + 4, 4]),
+            body("w", [low["w"], 0], [low["w"] + 3, 3], material=water),
+        ]
+        walls = {"x_min": "periodic", "x_max": "periodic", "y_min": "separate"}
+        domain = {"size": [32 * H, 16 * H], "walls": walls, "gravity": [0.0, -G], "friction": {"y_min": 0.1}}
+        return scene(bodies, 0.2, end=0.3, frames=6, domain=domain)
+
+    found, last = compare((pushed(0), pushed(11)), (11, 0), backend_of("f64", 1))
+    assert found < 1e-8
+    assert last.velocity[last.body == 1, 0].mean() > 0.3

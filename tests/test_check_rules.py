@@ -128,7 +128,7 @@ def test_bodies_that_separate_begin_where_they_like() -> None:
         ({}, True),
         ({"contact": {"default": "stick"}}, False),
         ({"contact": {"default": "separate", "friction": 0.3}}, False),
-        ({"domain": {"walls": {"x_min": "periodic", "x_max": "periodic"}}}, False),
+        ({"domain": {"walls": {"x_min": "periodic", "x_max": "periodic"}}}, True),
         ({"solver": {"solids": "total"}}, False),
         ({"solver": {"grid": "sparse"}}, False),
         ({"colliders": [{"name": "raft", "shape": box([0.6, 0.6], [0.8, 0.7]), "density": 500.0}]}, False),

@@ -92,8 +92,8 @@ def _sticking(facts: SceneFacts) -> Iterator[Finding]:
     scene = facts.scene
     elastic = [source.name for source in scene.sources if source.has_surface]
     given = scene.contact.pairs or "default" in scene.contact.model_fields_set
-    shared = any(scene.domain.periodic) or any(collider.free for collider in scene.colliders)
-    shared = shared or scene.solver.solids == "total" or scene.solver.grid == "sparse"
+    shared = scene.solver.solids == "total" or scene.solver.grid == "sparse"
+    shared = shared or any(collider.free for collider in scene.colliders)
     if len(elastic) > 1 and not given and not shared:
         reach = REACH[scene.solver.kernel]
         what = (

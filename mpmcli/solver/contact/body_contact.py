@@ -17,7 +17,7 @@ from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
 from mpmcli.scene.sampling import lattice_spacing
 from mpmcli.solver.contact.layers import Layers
-from mpmcli.solver.contact.surfaces import FAR, REACH, BodySurfaces, place_of
+from mpmcli.solver.contact.surfaces import FAR, REACH, BodySurfaces, image_of, image_sets, place_of
 from mpmcli.solver.grid.grid import Grid
 from mpmcli.solver.particles.arrays import ParticleArrays
 from mpmcli.solver.particles.sort import TileOrder, stay_rolled
@@ -204,18 +204,20 @@ class BodyContact:
         """Exchange momentum of layer a with layer c, or obstacle c - layers, at a node with this index in layer 0."""
         h, d, row = ti.static((grid.spacing, self.dimension, w * self.layers))
         at_a, at_c = index + a * ti.static(self.node_count), index + c * ti.static(self.node_count)
-        m_a, bodies, way, agree = grid.nodes[at_a][d], c < self.layers, FAR, 0.0
+        of_a = self.surfaces.total(grid, node, index, a * ti.static(self.node_count))
+        m_a, bodies, way, agree = of_a[d], c < self.layers, FAR, 0.0
         reduced, friction, known = m_a, 0.0, True
         # The sum of the inverse moduli of both.
         soft = 1.0 / self.rows[row + a, MODULUS]
         u, J, facing = ti.Vector.zero(float, d), ti.Vector.zero(float, d), ti.Vector.zero(float, d)
         if bodies:
-            m_c = grid.nodes[at_c][d]
+            of_c = self.surfaces.total(grid, node, index, c * ti.static(self.node_count))
+            m_c = of_c[d]
             # Evaluated in this order, because the product of two masses may be too small for single precision.
             reduced, friction = m_a * (m_c / (m_a + m_c)), self.rows[row + a, FRICTION + c]
             soft += 1.0 / self.rows[row + c, MODULUS]
             for b in ti.static(range(d)):
-                u[b] = grid.nodes[at_c][b] / m_c - grid.nodes[at_a][b] / m_a
+                u[b] = of_c[b] / m_c - of_a[b] / m_a
         if ti.static(obstacles.any):
             if not bodies:
                 distance, normal, velocity, rough, same = self.collect_obstacle(
@@ -224,7 +226,7 @@ class BodyContact:
                 way, friction, agree = distance, rough, same
                 for b in ti.static(range(d)):
                     facing[b] = normal[b]
-                    u[b] = velocity[b] - gravity_step[b] - grid.nodes[at_a][b] / m_a
+                    u[b] = velocity[b] - gravity_step[b] - of_a[b] / m_a
         if friction < 0.0:
             for b in ti.static(range(d)):
                 J[b] = -reduced * u[b]
@@ -392,41 +394,44 @@ class BodyContact:
         h, d = ti.static((grid.spacing, self.dimension))
         n_a, n_c, counts = ti.Vector.zero(float, d), ti.Vector.zero(float, d), ti.Vector.zero(int, 2)
         slopes, weights = ti.Matrix.zero(float, 2, d), ti.Vector.zero(float, 2)
-        place = self.surfaces.place_of(grid, w, index)
-        for q in range(ti.static(grid.scheme.spline.nodes**d)):
-            before, inside = self.surfaces.stencil_before(grid, node, q)
-            if inside:
-                for g in ti.static(self.surfaces.surfaced):
-                    p = self.surfaces.first[g][place - before]
-                    while p >= 0:
-                        layer = self.surfaces.shown[g][p]
-                        side = ti.select(layer == a, 0, ti.select(layer == c, 1, -1))
-                        if side >= 0:
-                            outwards = ti.select(side == 0, 1.0, -1.0)
-                            n, way, weight = ti.Vector.zero(float, d), ti.Vector.zero(float, d), 1.0
-                            for b in ti.static(range(d)):
-                                way[b] = ti.cast(node[b] - PAD, float) * h - self.surfaces.groups[g].x[p][b]
-                                n[b] = self.surfaces.surface[g][p][b]
-                                weight *= spline(way[b] * grid.inverse_spacing)
-                            if side == 0:
-                                n_a += weight * n
-                            else:
-                                n_c += weight * n
-                            weights[side] += weight
-                            for b in ti.static(range(d)):
-                                slopes[side, b] += weight * self.surfaces.surface[g][p][d + 1 + b]
-                            depth = self.surfaces.surface[g][p][d]
-                            if counts[side] < self.capacity:
-                                at = (2 * thread + side) * self.share + counts[side]
-                                for b in ti.static(range(d)):
-                                    # Entry by entry, because Taichi may lose vectors that are assigned as a whole.
-                                    way[b] -= depth * n[b]
-                                    self.points[at + b * self.capacity] = outwards * way[b]
-                                    self.points[at + ti.static(d + 1 + b) * self.capacity] = outwards * n[b]
-                                self.points[at + d * self.capacity] = way.norm_sqr() / (2.0 * BALL * h)
-                                self.points[at + ti.static(2 * d + 1) * self.capacity] = weight
-                                counts[side] += 1
-                        p = self.surfaces.following[g][p]
+        for images in range(ti.static(image_sets(grid))):
+            there, exists = image_of(grid, node, images)
+            if exists:
+                place = self.surfaces.place_of(grid, w, grid.linear_index(there))
+                for q in range(ti.static(grid.scheme.spline.nodes**d)):
+                    before, inside = self.surfaces.stencil_before(grid, there, q)
+                    if inside:
+                        for g in ti.static(self.surfaces.surfaced):
+                            p = self.surfaces.first[g][place - before]
+                            while p >= 0:
+                                layer = self.surfaces.shown[g][p]
+                                side = ti.select(layer == a, 0, ti.select(layer == c, 1, -1))
+                                if side >= 0:
+                                    outwards = ti.select(side == 0, 1.0, -1.0)
+                                    n, way, weight = ti.Vector.zero(float, d), ti.Vector.zero(float, d), 1.0
+                                    for b in ti.static(range(d)):
+                                        way[b] = ti.cast(there[b] - PAD, float) * h - self.surfaces.groups[g].x[p][b]
+                                        n[b] = self.surfaces.surface[g][p][b]
+                                        weight *= spline(way[b] * grid.inverse_spacing)
+                                    if side == 0:
+                                        n_a += weight * n
+                                    else:
+                                        n_c += weight * n
+                                    weights[side] += weight
+                                    for b in ti.static(range(d)):
+                                        slopes[side, b] += weight * self.surfaces.surface[g][p][d + 1 + b]
+                                    depth = self.surfaces.surface[g][p][d]
+                                    if counts[side] < self.capacity:
+                                        at = (2 * thread + side) * self.share + counts[side]
+                                        for b in ti.static(range(d)):
+                                            # Entry by entry, because Taichi may lose vectors assigned as a whole.
+                                            way[b] -= depth * n[b]
+                                            self.points[at + b * self.capacity] = outwards * way[b]
+                                            self.points[at + ti.static(d + 1 + b) * self.capacity] = outwards * n[b]
+                                        self.points[at + d * self.capacity] = way.norm_sqr() / (2.0 * BALL * h)
+                                        self.points[at + ti.static(2 * d + 1) * self.capacity] = weight
+                                        counts[side] += 1
+                                p = self.surfaces.following[g][p]
         for side, b in ti.static(ti.ndrange(2, d)):
             slopes[side, b] /= ti.max(weights[side], SMALLEST)
         return n_a.normalized(SMALLEST), n_c.normalized(SMALLEST), counts, slopes

@@ -7,7 +7,6 @@ import numpy as np
 
 from mpmcli.errors import InputError
 from mpmcli.scene import Scene
-from mpmcli.scene.domain import PERIODIC
 from mpmcli.scene.sampling import points_per_cell
 from mpmcli.solver.grid.sparse_grid import wants_sparse
 from mpmcli.solver.machine.backend import Backend
@@ -83,7 +82,6 @@ def require_contact_possible(scene: Scene, backend: Backend) -> None:
         "with solver.deterministic = true on a GPU": scene.solver.deterministic and not backend.on_cpu,
         'with solver.solids = "total"': scene.solver.solids == "total",
         "on a sparse grid": wants_sparse(scene),
-        "in a domain with periodic walls": any(PERIODIC in pair for pair in scene.domain.walls.faces(scene.dimension)),
         f"for more than {MOST_LAYERS} bodies": layers.count > MOST_LAYERS,
     }
     for reason, applies in reasons.items():

@@ -158,6 +158,22 @@ def place_of(node: ti.template(), spacing: float):
     return ti.cast(node - PAD, float) * spacing
 
 
+def image_sets(grid: Grid) -> int:
+    """Return the number of sets of axes along which a node may have an image: 1 without periodic axes."""
+    return 2**grid.dimension if grid.period.axes else 1
+
+
+@ti.func
+def image_of(grid: ti.template(), node: ti.template(), images: int):
+    """Return an image of a node, see `Period.image`, and whether it exists; none if the node is beyond a face."""
+    there, exists = node, True
+    if ti.static(len(grid.period.axes) > 0):
+        there, exists = grid.period.image(node, images)
+        for a in ti.static(grid.period.axes):
+            exists = exists and node[a] >= PAD and node[a] < PAD + grid.period.cells[grid.period.run][a]
+    return there, exists
+
+
 # Inverse of the smallest principal stretch up to which particles are found.
 CRUSHED = 4.0
 # Values in place of the first particle of a bin: empty, or closed. Value in place of the layer of a particle that is
@@ -295,6 +311,10 @@ class BodySurfaces:
             stay_rolled(self.orders[0].buffers.real, layer)
             for a in ti.static(range(d)):
                 first, end = box_of(grid, a, self.low[layer][a], self.high[layer][a], drift, last[a])
+                if ti.static(a in grid.period.axes):
+                    # Near a periodic face a layer extends over the domain, so that it meets images of other layers.
+                    self.low[layer][a] = ti.min(self.low[layer][a], first + drift)
+                    self.high[layer][a] = ti.max(self.high[layer][a], end - reach - drift)
                 # Emitted material, and bodies that share its layer, may be anywhere in the box of all layers.
                 if ti.static(self.shares):
                     if layer == begin:
@@ -373,7 +393,8 @@ class BodySurfaces:
                     place = self.place_of(grid, w, index)
                     for k in range(begin, end):
                         stay_rolled(self.orders[0].buffers.real, place + k)
-                        if grid.nodes[index + behind + k][last + 1] > 0.0:
+                        node[last] = k
+                        if self.total(grid, node, index + k, behind)[last + 1] > 0.0:
                             self.present[place + k] = 256 * self.present[place + k] + layer + 1
         for row in range(first, after):
             node = grid.row_start(row)
@@ -391,15 +412,38 @@ class BodySurfaces:
                 node[last] += 1
 
     @ti.func
+    def total(self, grid: ti.template(), node: ti.template(), index: int, behind: int):
+        """Return momentum and mass of a node of a layer with its periodic images; zero at an image beyond a face.
+
+        `index` is the index of the node in layer 0, and `behind` the offset of the layer.
+        """
+        result = ti.Vector.zero(float, ti.static(self.dimension + 1))
+        if ti.static(len(grid.period.axes) == 0):
+            for c in ti.static(range(self.dimension + 1)):
+                result[c] = grid.nodes[behind + index][c]
+        else:
+            for images in range(ti.static(image_sets(grid))):
+                there, exists = image_of(grid, node, images)
+                if exists:
+                    at = behind + grid.linear_index(there)
+                    for c in ti.static(range(self.dimension + 1)):
+                        result[c] += grid.nodes[at][c]
+        return result
+
+    @ti.func
     def meet(self, grid: ti.template(), node: ti.template(), place: int, met: int):
         """Store `met` of a node, and open the bins of the stencils that contain it."""
         self.met[place] = met
         if met > 0:
-            for q in range(ti.static(grid.scheme.spline.nodes**self.dimension)):
-                before, inside = self.stencil_before(grid, node, q)
-                if inside:
-                    for g in ti.static(self.surfaced):
-                        self.first[g][place - before] = EMPTY
+            for images in range(ti.static(image_sets(grid))):
+                there, exists = image_of(grid, node, images)
+                if exists:
+                    offset = grid.linear_index(there) - grid.linear_index(node)
+                    for q in range(ti.static(grid.scheme.spline.nodes**self.dimension)):
+                        before, inside = self.stencil_before(grid, there, q)
+                        if inside:
+                            for g in ti.static(self.surfaced):
+                                self.first[g][place + offset - before] = EMPTY
 
     @ti.func
     def find(self, grid: ti.template(), obstacles: ti.template(), w: int, node: ti.template()):
@@ -413,7 +457,7 @@ class BodySurfaces:
                 beyond = node[a] - self.used[used, a]
                 inside = inside and beyond >= 0 and beyond < self.used[used + 1, a]
             if inside:
-                if grid.nodes[index + layer * ti.static(self.node_count)][self.dimension] > 0.0:
+                if self.total(grid, node, index, layer * ti.static(self.node_count))[self.dimension] > 0.0:
                     present = 256 * present + layer + 1
         self.present[place] = present
         bodies = self.bodies_at(place)
