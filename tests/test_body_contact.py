@@ -139,12 +139,12 @@ def test_pairs_that_cannot_be_are_one_sentence(pairs: list, said: str) -> None:
         ({}, "metal", "with --arch metal"),
         ({"solver": {"deterministic": True}}, "vulkan", "with solver.deterministic = true on a GPU"),
         ({"solver": {"solids": "total"}, "domain": {"walls": "separate"}}, "cpu", 'with solver.solids = "total"'),
-        ({"solver": {"grid": "sparse"}}, "cpu", "on a sparse grid"),
+        ({"solver": {"grid": "sparse"}}, "cpu", 'with solver.grid = "sparse"'),
     ],
 )
 def test_what_has_one_velocity_field_is_refused(tables: dict, arch: str, reason: str) -> None:
     two = scene([body("a", [2, 2], [8, 8]), body("b", [12, 2], [18, 8])], **tables)
-    with pytest.raises(InputError, match=f"separating bodies are not available {reason}; set "):
+    with pytest.raises(InputError, match=f"separating bodies are not available {reason}; change this, or set "):
         require_contact_possible(two, Backend(arch, 1, "f32", False))
 
 

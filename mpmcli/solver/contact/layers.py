@@ -76,16 +76,17 @@ def require_contact_possible(scene: Scene, backend: Backend) -> None:
     Raises:
         InputError: names the property of the scene or the backend with which contact is not available.
     """
-    layers = Layers.of(scene)
+    layers, solver = Layers.of(scene), scene.solver
     reasons = {
         f"with --arch {backend.arch}": not backend.doubles,
-        "with solver.deterministic = true on a GPU": scene.solver.deterministic and not backend.on_cpu,
-        'with solver.solids = "total"': scene.solver.solids == "total",
-        "on a sparse grid": wants_sparse(scene),
+        "with solver.deterministic = true on a GPU": solver.deterministic and not backend.on_cpu,
+        'with solver.solids = "total"': solver.solids == "total",
+        'with solver.grid = "sparse"': wants_sparse(scene),
         f"for more than {MOST_LAYERS} bodies": layers.count > MOST_LAYERS,
     }
     for reason, applies in reasons.items():
         if applies and layers.separate:
             raise InputError(
-                f'separating bodies are not available {reason}; set contact.default = "stick" and omit the pairs.'
+                f'separating bodies are not available {reason}; change this, or set contact.default = "stick" and omit '
+                "the pairs."
             )
