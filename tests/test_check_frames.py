@@ -111,10 +111,10 @@ def test_a_viscous_liquid_that_sprays_is_told(viscosity: float, mean: float, fir
     assert [one.rule for one in crowds(scene, [POOL], volume_ratio=J)[1]] == ["spray"] * fires
 
 
-def bar(speed: float, count: int = 4, **more: object) -> Scene:
+def bar(speed: float, count: int = 4, walls: str = "separate", **more: object) -> Scene:
     """Return a bar of 8 x 4 cells whose ends move apart, each at `speed` times sqrt(E / density)."""
     return scene_of(
-        domain={"size": [48 * H, 16 * H], "spacing": H, "walls": "separate"},
+        domain={"size": [48 * H, 16 * H], "spacing": H, "walls": walls},
         time={"end": LENGTH / SOUND, "frames": 20},
         bodies=[
             {
@@ -221,6 +221,13 @@ def test_neighbours_of_elastic_bodies_are_followed(law: str, sampling: str, stre
     assert [(one.frame, "1 more frame" in one.what) for one in found] == [(1, True)] * fires
     if sampling == "lattice" and law == "neo_hookean":
         assert figures["neighbour_distance"] == pytest.approx(stretch / 2)
+
+
+def test_neighbours_on_both_sides_of_a_periodic_face_are_near_each_other() -> None:
+    scene = bar(0.0, walls="periodic")
+    x, size = sample_bodies(scene)[0].position, np.array(scene.domain.size)
+    figures, found = seen(StretchCheck, header_of(scene), [x, (x + size / 2) % size])
+    assert found == [] and figures["neighbour_distance"] == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize(("transfer", "drift"), [("apic", 0.05), ("aflip", 0.0)])

@@ -232,7 +232,7 @@ class StretchCheck(FrameCheck):
         if self._pairs is None:
             self._pairs = [] if h is None else list(self._neighbours(frame, h))
         for body, first, second, allowed in self._pairs:
-            apart = frame.position[second] - frame.position[first]
+            apart = header.shortest(frame.position[second] - frame.position[first])
             squares = np.einsum("ij,ij->i", apart, apart)
             cells = float(np.sqrt(float(squares.max()))) / h
             self._most("neighbour_distance", cells)

@@ -342,6 +342,13 @@ class RunHeader:
         shifts = last // INTERVAL - (last - steps) // INTERVAL
         return shifts * 2 * FARTHEST * self.spacing if self.shifts and self.spacing is not None else 0.0
 
+    def shortest(self, way: np.ndarray) -> np.ndarray:
+        """Return vectors between particles, (n, d) m, as those to the nearest image along periodic axes."""
+        if self.origin is None or not self.periodic.any():
+            return way
+        size = np.where(self.periodic, self.upper - self.origin, np.inf)
+        return way - np.where(self.periodic, size, 0.0) * np.round(way / size)
+
     def body_name(self, label: int) -> str:
         """Return the name of a body, or its number if it has none."""
         return self.bodies[label].name if 0 <= label < len(self.bodies) else f"number {label}"
