@@ -137,6 +137,14 @@ def billiard_2d(result: Result) -> str:
     return f"momentum {max(errors):.0e} off until a ball is at a cushion, at t = {frame.time:.2f} s"
 
 
+def soft_grains_2d(result: Result) -> str:
+    """Say how far the momentum is off, relative to the sum of the momenta of the grains."""
+    first, frame = np.array(result.ledger[0].linear_momentum), result.frame(0)
+    drift = max(np.abs(np.array(row.linear_momentum) - first).max() for row in result.ledger)
+    speed = np.linalg.norm(frame.velocity, axis=1).mean()
+    return f"momentum {drift / (result.ledger[0].mass * speed):.0e} off"
+
+
 def rolling_3d(result: Result) -> str:
     """Compare how far the balls come with 5/7 g sin a t^2 / 2 and g sin a t^2 / 2."""
     first, last = result.frame(0), result.frame(len(result.times) - 1)
@@ -377,6 +385,7 @@ KNOWN_ANSWERS = {
     "stack_2d": stack_2d,
     "rolling_3d": rolling_3d,
     "billiard_2d": billiard_2d,
+    "soft_grains_2d": soft_grains_2d,
     "snowball_wall_2d": snowball_wall,
     "snowball_wall_3d": snowball_wall,
     "sand_column_2d": sand_column_2d,

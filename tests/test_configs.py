@@ -56,6 +56,7 @@ def test_these_are_the_scenes():
         "silo_3d",
         "snowball_wall_2d",
         "snowball_wall_3d",
+        "soft_grains_2d",
         "stack_2d",
         "stirred_tank_2d",
     ]
