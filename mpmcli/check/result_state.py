@@ -10,7 +10,7 @@ from mpmcli.check.material_rules import VISCOUS
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.materials.registry import laws
-from mpmcli.output.header import BodyHeader, RunHeader
+from mpmcli.output.header import BodyHeader, RunHeader, nearest_image
 from mpmcli.plain_text import counted
 
 # No law is valid for J below the first. Coherent material would have torn for J above the second.
@@ -232,7 +232,7 @@ class StretchCheck(FrameCheck):
         if self._pairs is None:
             self._pairs = [] if h is None else list(self._neighbours(frame, h))
         for body, first, second, allowed in self._pairs:
-            apart = header.shortest(frame.position[second] - frame.position[first])
+            apart = nearest_image(frame.position[second] - frame.position[first], header.period)
             squares = np.einsum("ij,ij->i", apart, apart)
             cells = float(np.sqrt(float(squares.max()))) / h
             self._most("neighbour_distance", cells)

@@ -10,7 +10,7 @@ from mpmcli import __version__
 from mpmcli.dataset.shard import SPLITS
 from mpmcli.dataset.subsample import SubsampledTrajectory
 from mpmcli.errors import InputError
-from mpmcli.output.header import RunHeader
+from mpmcli.output.header import RunHeader, nearest_image
 
 # Neighbours of a particle on the lattice of the start lie at 1 and sqrt(2) spacings, 8 in 2D and 18 in 3D, and the next
 # ones at 2 (2D) and sqrt(3) (3D). LagrangeBench takes about the same (1.45, data_gen/.../gen_dataset.py).
@@ -79,17 +79,16 @@ def outruns_periods(trajectory: SubsampledTrajectory) -> bool:
     header, stride = trajectory.source.header, trajectory.stride
     if not header.periodic.any():
         return False
-    axes = np.flatnonzero(header.periodic)
-    period = (header.upper - header.origin)[axes]
+    period = header.period
     longest = np.diff(trajectory.source.times).max(initial=0.0)
     whole = SubsampledTrajectory(trajectory.source)
     number, position, way = 0, None, 0.0
     for block, velocity in zip(whole.blocks("position"), whole.blocks("velocity"), strict=True):
-        if (np.abs(velocity[..., axes]) * longest >= period / 2).any():
+        if (np.abs(velocity) * longest >= period / 2).any():
             return True
-        for after in block[..., axes].astype(float):
+        for after in block.astype(float):
             if position is not None:
-                way = way + after - position - period * np.round((after - position) / period)
+                way = way + nearest_image(after - position, period)
             if number % stride == 0:
                 if (np.abs(way) >= period / 2).any():
                     return True
@@ -104,10 +103,8 @@ def learning_facts(trajectories: Sequence[SubsampledTrajectory]) -> tuple[dict[s
     notes = [] if train else ["No trajectory is of the training split: the statistics are those of all trajectories."]
     chosen = train or trajectories
     headers = [each.source.header for each in chosen]
-    # Period of the domain along each axis, m; infinite if it is not periodic.
-    periods = [np.where(header.periodic, header.upper - header.origin, np.inf) for header in headers]
-    known = periods if np.isfinite(periods).any() else None
-    statistics = motion_statistics((each.blocks("position") for each in chosen), known)
+    periods = [header.period for header in headers]
+    statistics = motion_statistics((each.blocks("position") for each in chosen), periods)
     return {name: vector.tolist() for name, vector in statistics.items()}, notes
 
 
@@ -194,8 +191,7 @@ def _of_trajectory(blocks: Iterable[np.ndarray], period: np.ndarray | None) -> t
         joined = positions if before is None else np.concatenate([before, positions])
         v = np.diff(joined, axis=0)
         if period is not None:
-            for a in np.flatnonzero(np.isfinite(period)):
-                v[..., a] -= period[a] * np.round(v[..., a] / period[a])
+            v = nearest_image(v, period)
         a = np.diff(v, axis=0)
         # The displacement between the two frames that are carried over was already counted.
         new = v if before is None else v[len(before) - 1 :]

@@ -24,6 +24,14 @@ from mpmcli.stability.transfer_factors import FARTHEST, INTERVAL
 _DEFAULTS = {name: field.default for name, field in SolverSettings.model_fields.items()}
 
 
+def nearest_image(way: np.ndarray, period: np.ndarray) -> np.ndarray:
+    """Return vectors between particles, (..., d), m, as those to the nearest images; see `RunHeader.period`."""
+    if not np.isfinite(period).any():
+        return way
+    turns = np.round(way / period)
+    return way - np.where(turns == 0, 0.0, period) * turns
+
+
 class _Facts(BaseModel):
     """Entries of a file; other entries are ignored, and missing ones are unknown."""
 
@@ -342,12 +350,11 @@ class RunHeader:
         shifts = last // INTERVAL - (last - steps) // INTERVAL
         return shifts * 2 * FARTHEST * self.spacing if self.shifts and self.spacing is not None else 0.0
 
-    def shortest(self, way: np.ndarray) -> np.ndarray:
-        """Return vectors between particles, (n, d) m, as those to the nearest image along periodic axes."""
-        if self.origin is None or not self.periodic.any():
-            return way
-        size = np.where(self.periodic, self.upper - self.origin, np.inf)
-        return way - np.where(self.periodic, size, 0.0) * np.round(way / size)
+    @property
+    def period(self) -> np.ndarray:
+        """Period of the domain along each axis, (d,), m; infinite if it is not periodic or unknown."""
+        unknown = self.origin is None
+        return np.where(self.periodic, np.inf if unknown else self.upper - self.origin, np.inf)
 
     def body_name(self, label: int) -> str:
         """Return the name of a body, or its number if it has none."""

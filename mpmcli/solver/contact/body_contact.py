@@ -17,7 +17,7 @@ from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
 from mpmcli.scene.sampling import lattice_spacing
 from mpmcli.solver.contact.layers import Layers
-from mpmcli.solver.contact.surfaces import FAR, REACH, BodySurfaces, image_of, image_sets, place_of
+from mpmcli.solver.contact.surfaces import FAR, REACH, BodySurfaces, place_of
 from mpmcli.solver.grid.grid import Grid
 from mpmcli.solver.particles.arrays import ParticleArrays
 from mpmcli.solver.particles.sort import TileOrder, stay_rolled
@@ -394,8 +394,8 @@ class BodyContact:
         h, d = ti.static((grid.spacing, self.dimension))
         n_a, n_c, counts = ti.Vector.zero(float, d), ti.Vector.zero(float, d), ti.Vector.zero(int, 2)
         slopes, weights = ti.Matrix.zero(float, 2, d), ti.Vector.zero(float, 2)
-        for images in range(ti.static(image_sets(grid))):
-            there, exists = image_of(grid, node, images)
+        for images in range(ti.static(grid.period.sets)):
+            there, exists = grid.period.image_from_inside(node, images)
             if exists:
                 place = self.surfaces.place_of(grid, w, grid.linear_index(there))
                 for q in range(ti.static(grid.scheme.spline.nodes**d)):

@@ -158,22 +158,6 @@ def place_of(node: ti.template(), spacing: float):
     return ti.cast(node - PAD, float) * spacing
 
 
-def image_sets(grid: Grid) -> int:
-    """Return the number of sets of axes along which a node may have an image: 1 without periodic axes."""
-    return 2**grid.dimension if grid.period.axes else 1
-
-
-@ti.func
-def image_of(grid: ti.template(), node: ti.template(), images: int):
-    """Return an image of a node, see `Period.image`, and whether it exists; none if the node is beyond a face."""
-    there, exists = node, True
-    if ti.static(len(grid.period.axes) > 0):
-        there, exists = grid.period.image(node, images)
-        for a in ti.static(grid.period.axes):
-            exists = exists and node[a] >= PAD and node[a] < PAD + grid.period.cells[grid.period.run][a]
-    return there, exists
-
-
 # Inverse of the smallest principal stretch up to which particles are found.
 CRUSHED = 4.0
 # Values in place of the first particle of a bin: empty, or closed. Value in place of the layer of a particle that is
@@ -218,7 +202,8 @@ class BodySurfaces:
         layers: number of layers per run.
         groups, orders: groups of particles and their tile orders.
         surfaced: indices of the groups with surfaces.
-        low, high: per layer of each run, the range of first nodes of stencils at the last sort.
+        low, high: per layer of each run, the range of first nodes of stencils at the last sort; along a periodic axis
+            the whole axis from the step on in which the layer comes near a face.
         used: per layer of each run, the nodes in use, as in `Grid.box`.
         box: per run, the box of nodes where layers may be in contact with each other or with an obstacle.
         drift: per run, the largest displacement of particles since the sort, cells.
@@ -312,7 +297,6 @@ class BodySurfaces:
             for a in ti.static(range(d)):
                 first, end = box_of(grid, a, self.low[layer][a], self.high[layer][a], drift, last[a])
                 if ti.static(a in grid.period.axes):
-                    # Near a periodic face a layer extends over the domain, so that it meets images of other layers.
                     self.low[layer][a] = ti.min(self.low[layer][a], first + drift)
                     self.high[layer][a] = ti.max(self.high[layer][a], end - reach - drift)
                 # Emitted material, and bodies that share its layer, may be anywhere in the box of all layers.
@@ -422,8 +406,8 @@ class BodySurfaces:
             for c in ti.static(range(self.dimension + 1)):
                 result[c] = grid.nodes[behind + index][c]
         else:
-            for images in range(ti.static(image_sets(grid))):
-                there, exists = image_of(grid, node, images)
+            for images in range(ti.static(grid.period.sets)):
+                there, exists = grid.period.image_from_inside(node, images)
                 if exists:
                     at = behind + grid.linear_index(there)
                     for c in ti.static(range(self.dimension + 1)):
@@ -435,8 +419,8 @@ class BodySurfaces:
         """Store `met` of a node, and open the bins of the stencils that contain it."""
         self.met[place] = met
         if met > 0:
-            for images in range(ti.static(image_sets(grid))):
-                there, exists = image_of(grid, node, images)
+            for images in range(ti.static(grid.period.sets)):
+                there, exists = grid.period.image_from_inside(node, images)
                 if exists:
                     offset = grid.linear_index(there) - grid.linear_index(node)
                     for q in range(ti.static(grid.scheme.spline.nodes**self.dimension)):

@@ -35,6 +35,7 @@ class Period:
 
     Attributes:
         axes: the periodic axes.
+        sets: number of sets of axes along which a node may have an image, including the empty set.
         at_once: whether every step wraps particles into the domain.
         run: number of the run of a view.
         extent: size of the domain per run and axis, m.
@@ -44,6 +45,7 @@ class Period:
     def __init__(self, faces: Sequence[tuple[str, str]], runs: int = 1, *, at_once: bool) -> None:
         self.dimension = len(faces)
         self.axes = tuple(a for a, pair in enumerate(faces) if PERIODIC in pair)
+        self.sets = 2**self.dimension if self.axes else 1
         self.at_once = at_once
         self.run = 0
         if self.axes:
@@ -134,4 +136,14 @@ class Period:
                         there = node[a] - cells
                 place[a] = there
                 exists = exists and there >= 0
+        return place, exists
+
+    @ti.func
+    def image_from_inside(self, node: ti.template(), images: int):
+        """Return the same as `image` for a node inside the domain, and no image for one beyond a periodic face."""
+        place, exists = node, True
+        if ti.static(len(self.axes) > 0):
+            place, exists = self.image(node, images)
+            for a in ti.static(self.axes):
+                exists = exists and node[a] >= PAD and node[a] < PAD + self.cells[self.run][a]
         return place, exists
