@@ -2,6 +2,7 @@
 
 import ast
 import errno
+import hashlib
 import os
 import signal
 import subprocess
@@ -15,6 +16,7 @@ import pytest
 from conftest import ROOT
 from solver_state import scene_of
 
+from mpmcli.materials import fluid
 from mpmcli.scene import Scene, sample_bodies
 from mpmcli.solver.engine import batch, kernel_store
 from mpmcli.solver.engine.compiled_kind import CompiledKind
@@ -100,6 +102,12 @@ def test_a_sparse_grid_that_grows_has_kernels_of_its_own(folder: Path, monkeypat
     assert len(grown) == 2
 
 
+def tic(code: bytes) -> bytes:
+    """Return a file of Taichi."""
+    head = kernel_store.HEAD.pack(b"TIC\0", 0, 0, len(code))
+    return head + code + hashlib.sha256(code).hexdigest().encode()
+
+
 HARMS = {
     "flip": lambda content: content[: len(content) // 2] + b"~" + content[len(content) // 2 + 1 :],
     "cut": lambda content: content[:-100],
@@ -146,16 +154,16 @@ def test_a_file_that_cannot_be_written_stays(tmp_path: Path, monkeypatch: pytest
 
 
 def test_the_key_has_all_that_a_kernel_is_made_from(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Another law, wall, precision of the solver, number of threads or runs; processor; source; fields before it."""
+    """Another law, wall, precision of the solver, number of threads or runs; processor; fields before it; source."""
 
-    def key(scene: Scene, threads: int = 1, runs: int = 1, before: int = 0) -> str:
+    def key(scene: Scene, threads: int = 1, runs: int = 1, before: int = 0, sources: str = "") -> str:
         backend = start(choose_backend("cpu", threads, "f32"))
         for _ in range(before):
             build_run(drop(), backend)
         run = build_run(scene, backend)
         kind = CompiledKind.of(scene, sample_bodies(scene)).padded()
         assert kind == run.batch.kind
-        found = kernel_store.kernel_key(kind, backend, runs)
+        found = kernel_store.kernel_key(kind, backend, runs, sources)
         stop_backend()
         return found
 
@@ -172,15 +180,68 @@ def test_the_key_has_all_that_a_kernel_is_made_from(folder: Path, monkeypatch: p
         key(drop(), threads=2),
         key(drop(), runs=2),
         key(drop(), before=1),
+        key(drop(), sources="another"),
     ]
-    for name in ("_machine", "_sources"):
-        with monkeypatch.context() as patch:
-            patch.setattr(kernel_store, name, lambda: "another")
-            others.append(key(drop()))
+    with monkeypatch.context() as patch:
+        patch.setattr(kernel_store, "_machine", lambda: "another")
+        others.append(key(drop()))
     with monkeypatch.context() as patch:
         patch.setenv("TI_ADVANCED_OPTIMIZATION", "1")
         others.append(key(drop()))
     assert len({usual, *others}) == 1 + len(others)
+
+
+def test_edited_sources_compile_what_they_change(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another sentence in the sources needs a stub, not a kernel; another constant of a law needs a kernel.
+
+    Sources that return find theirs, and of two kernels of one name the one in use is linked.
+    """
+    material = {"law": "fluid", "density": 1000.0, "bulk_modulus": 1e5, "exponent": 7.0}
+    scene = drop(bodies=[drop().bodies[0].model_dump(include={"name", "shape"}) | {"material": material}])
+    usual = outcome(scene)
+
+    def edited(sources: str, crushed: float, kernels: int) -> Outcome:
+        """Run twice with other sources; there are so many kernels then."""
+        with monkeypatch.context() as patch:
+            patch.setattr(kernel_store, "_sources", lambda: sources)
+            patch.setattr(fluid, "CRUSHED", crushed)
+            first, second = outcome(scene), outcome(scene)
+        assert second == replace(first, stored=True)
+        assert len({path.read_bytes() for path in kernels_in(folder)}) == kernels
+        return first
+
+    assert edited("a sentence", fluid.CRUSHED, 1) == usual
+    constant = edited("a constant", 1.5, 2)
+    assert not constant.stored and constant.frame != usual.frame
+    assert outcome(scene) == replace(usual, stored=True)
+    # Taichi records uses in seconds.
+    time.sleep(1.1)
+    assert edited("another sentence", fluid.CRUSHED, 2) == usual
+    assert edited("a constant", 1.5, 2) == replace(constant, stored=True)
+
+
+def test_a_stale_kernel_is_not_linked(tmp_path: Path) -> None:
+    """A stub becomes the kernel of its name that was used when it was compiled, if that is sound and the only one."""
+    usual = {"stub": (20, 20, b"stub_key"), "a": (10, 20, tic(b"launch_own, a")), "b": (5, 19, tic(b"launch_own, b"))}
+
+    def linked(**changed: tuple[int, int, bytes]) -> bytes:
+        """Return the file of the stub after linking; a file is created and used at two times, s."""
+        files = {f"T{hashlib.sha256(name.encode()).hexdigest()}": file for name, file in {**usual, **changed}.items()}
+        rows = [(65, name.encode(), 65, name.encode(), 0, *times) for name, (*times, _) in files.items()]
+        entries = b"".join(kernel_store.ENTRY.pack(*row) for row in rows)
+        head = kernel_store.LIST_HEAD.pack(kernel_store.LIST_HEAD.size + len(entries), 1, 7, 4, 0, len(rows))
+        (tmp_path / kernel_store.LIST).write_bytes(head + entries)
+        for name, (*_, content) in files.items():
+            (tmp_path / f"{name}.tic").write_bytes(content)
+        kernel_store._link("key", "launch_own", tmp_path)
+        return (tmp_path / f"{next(iter(files))}.tic").read_bytes()
+
+    *_, a = usual["a"]
+    *_, b = usual["b"]
+    assert linked() == linked(b=(5, 20, a)) == linked(b=(5, 20, tic(b"launch_other"))) == a
+    assert linked(a=(10, 19, a), b=(5, 20, b)) == b
+    for changed in ({"b": (5, 20, b)}, {"a": (10, 19, a)}, {"a": (10, 20, a[:-1])}, {"a": (10, 20, b"")}):
+        assert linked(**changed) == b"stub_key", changed
 
 
 def test_sources_are_all_that_kernels_import(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

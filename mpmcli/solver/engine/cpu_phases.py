@@ -19,7 +19,15 @@ from mpmcli.solver.engine.step import Phase, sorted_fields
 from mpmcli.solver.frames.reader import show_range
 from mpmcli.solver.grid.grid import clear_blocks, clear_rows
 from mpmcli.solver.grid.sparse_grid import BLOCKS, PENCILS
-from mpmcli.solver.particles.sort import count_tiles, keep_all, place_particles, scratch_offset, share_start, take_all
+from mpmcli.solver.particles.sort import (
+    count_tiles,
+    keep_all,
+    place_particles,
+    scratch_offset,
+    share_start,
+    stay_rolled,
+    take_all,
+)
 from mpmcli.solver.transfer.cpu_transfers import (
     advance_range,
     advance_tiles,
@@ -328,6 +336,9 @@ class CpuPhases(RunPhases):
             (at,) = ti.static((Part(view, self.kinds[k], turn, region, part, t, frame_buffer),))
             ti.static(self.body(self.kinds[k]))(at)
         if ti.static(k + 1 < len(self.kinds)):
+            # A second call, which is never executed, prevents LLVM from inlining functions that are called once.
+            if phase < 0:
+                self.do(ti.static(k + 1), w, phase, region, part, t, numbers, counts, frame_buffer)
             self.do(ti.static(k + 1), w, phase, region, part, t, numbers, counts, frame_buffer)
 
     # Loops that apply a function to each node or particle.
@@ -356,6 +367,7 @@ class CpuPhases(RunPhases):
         for row in range(first, after):
             node = at.grid.row_start(row)
             for _ in range(at.grid.row_length(node)):
+                stay_rolled(at.order.buffers.real, node[last_axis])
                 ti.static(at.item)(at, node, at.step.relaxed)
                 node[last_axis] += 1
 
@@ -447,6 +459,7 @@ class CpuPhases(RunPhases):
             first, after = self.share(first, after, at.part)
             change = 0.0
             for p in range(first, after):
+                stay_rolled(at.order.buffers.real, p)
                 change = ti.max(change, at.particles.relax(self.device.groups[at.g], p, relaxed))
             ti.atomic_max(at.step.volume_change[at.g], change)
 

@@ -1,10 +1,12 @@
 """Loads the compiled kernel of a batch without Taichi's front end, which takes at least a third of a warm start.
 
-Taichi caches compiled kernels in files, by a key of their intermediate representation, which its front end must
-generate first. The store uses a key of all inputs of a kernel instead. A stub, a kernel of a few lines that Taichi
-finds in a millisecond, contains this key in its source. After Taichi has written the files of both, the file of the
-stub is replaced by that of the kernel, so that launching the stub runs the kernel. Taichi verifies the checksum of a
-file. If the file is damaged or missing, the stub itself is compiled and leaves a mark; then the kernel is launched.
+Taichi caches compiled kernels in files, by a hash of their intermediate representation, which its front end must
+generate first. The store uses a key of all inputs of a kernel instead, the sources of the package among them. A stub, a
+kernel of a few lines that Taichi finds in a millisecond, contains this key in its source. After Taichi has written the
+files of both, the file of the stub is replaced by that of the kernel, so that launching the stub runs the kernel.
+Taichi verifies the checksum of a file. If the file is damaged or missing, the stub itself is compiled and leaves a
+mark; then the kernel is launched. The kernel does not contain the key: edited sources need another stub, but Taichi
+finds the kernel if its representation is the same.
 """
 
 import contextlib
@@ -14,7 +16,6 @@ import platform
 import re
 import struct
 import sys
-import time
 from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
@@ -35,18 +36,24 @@ PACKAGE = Path(__file__).resolve().parents[2]
 # hexadecimal.
 HEAD = struct.Struct("<4sIQQ")
 DIGEST = 64
+# Taichi's list of its files: length, version, bytes of all files, number of entries; then the entries: key and name of
+# the file, each after its length; bytes, and the times of creation and of the last recorded use, s.
+LIST, LIST_HEAD = "ticache.tcb", struct.Struct("<Q3HQQ")
+ENTRY = struct.Struct("<Q65sQ65sQqq")
 # Subpackages from which kernels are generated; their imports are among them, or modules of the package itself.
 SOURCES = ("scene", "frames", "stability", "materials", "boundaries", "solver")
 # Text that does not affect kernels: docstrings, which start a line, and comment lines.
 PROSE = re.compile(rb'^ *""".*?"""\n|^ *#[^\n]*\n', re.MULTILINE | re.DOTALL)
 # Upper bound of the difference between the clocks of a file system and of this machine, s.
 CLOCKS = 2.0
+# Upper bound of the bytes of a file that contains a stub, and lower bound of those of a kernel.
+STUB_BYTES = 2**14
 # Value that the stub stores in frame_stats[0, 0, 0], which is otherwise never negative.
 MARK = -(2**30)
 # Environment variable; "off" disables the store, for work on modules while they run.
 SWITCH = "MPMCLI_KERNEL_STORE"
-# Keys of kernels compiled by this process, with the folder of Taichi's files and the start time of the compilation, s.
-_compiled: dict[str, tuple[Path, float]] = {}
+# Keys of kernels that this process did not find by their stubs, with their names and the folder of Taichi's files.
+_missed: dict[str, tuple[str, Path]] = {}
 
 
 class StoredLaunch:
@@ -72,19 +79,20 @@ class StoredLaunch:
     def _first(
         self, numbers: np.ndarray, counts: np.ndarray, frame_buffer: np.ndarray, frame_stats: np.ndarray
     ) -> None:
-        key = ""
+        name = "launch"
         if self._may_store():
-            key = kernel_key(self._kind, self._backend, self._launch.device.runs)
+            facts = (self._kind, self._backend, self._launch.device.runs)
+            own, key = kernel_key(*facts), kernel_key(*facts, _sources())
             stub, noted = stub_kernel(key), frame_stats[0, 0, 0]
             stub(numbers, counts, frame_buffer, frame_stats)
             if frame_stats[0, 0, 0] != MARK:
                 self._kernel, self.stored = stub, True
                 return
             frame_stats[0, 0, 0] = noted
-            self._launch.token = words_of(key)
-            _compiled[key] = Path(ti.lang.impl.current_cfg().offline_cache_file_path), time.time()
-            after_stop(store_compiled)
-        with _named(CpuLaunch.launch._primal.func, f"launch_{key}" if key else "launch"):
+            name, self._launch.token = f"launch_{own}", words_of(own)
+            _missed[key] = name, Path(ti.lang.impl.current_cfg().offline_cache_file_path)
+            after_stop(link_missed)
+        with _named(CpuLaunch.launch._primal.func, name):
             self._launch.launch(numbers, counts, frame_buffer, frame_stats)
         self._kernel = self._launch.launch
 
@@ -123,14 +131,18 @@ def stub_kernel(key: str) -> Callable[..., None]:
     return ti.kernel(stub)
 
 
-def kernel_key(kind: CompiledKind, backend: Backend, runs: int) -> str:
-    """Return a key of all inputs of the kernel of a batch, including the memory layout of its fields."""
+def kernel_key(kind: CompiledKind, backend: Backend, runs: int, sources: str = "") -> str:
+    """Return a key of the inputs of the kernel of a batch, including the memory layout of its fields.
+
+    The sources of the package are among them if their digest is given; otherwise they decide by what Taichi makes of
+    them, and the key names a kernel for which there may be several files.
+    """
     ti.lang.impl.get_runtime().materialize()
     config = ti.lang.impl.current_cfg()
     # Settings that do not affect code are excluded; Taichi leaves one of them uninitialised.
     beside = ("_", "print_", "offline_cache")
     settings = [(name, str(getattr(config, name))) for name in dir(config) if not name.startswith(beside)]
-    facts = (kind, backend, runs, settings, _layout(), _machine(), _sources())
+    facts = (kind, backend, runs, settings, _layout(), _machine(), sources)
     return hashlib.sha256(repr(facts).encode()).hexdigest()[:32]
 
 
@@ -178,26 +190,37 @@ def _sources() -> str:
     return digest.hexdigest()
 
 
-def store_compiled() -> None:
-    """Replace the files of stubs by those of the kernels compiled in this process, after Taichi has written both."""
-    while _compiled:
-        key, (folder, began) = _compiled.popitem()
+def link_missed() -> None:
+    """Replace the files of stubs by those of the kernels launched in their place, after Taichi has written both."""
+    while _missed:
+        key, (name, folder) = _missed.popitem()
         with contextlib.suppress(OSError):
-            # Their files are new, unless an earlier process was killed at this point.
-            if not _store(key, folder, began - CLOCKS):
-                _store(key, folder, 0.0)
+            _link(key, name, folder)
 
 
-def _store(key: str, folder: Path, since: float) -> bool:
-    """Replace the stub of a key by its kernel if both were written since a time, s; return whether they were found."""
-    paths = [path for path in folder.glob("*.tic") if path.stat().st_mtime >= since]
-    contents = [(path, path.read_bytes()) for path in paths]
-    kernels = [one for _, one in contents if f"launch_{key}".encode() in one and _is_sound(one)]
-    stubs = [path for path, one in contents if f"stub_{key}".encode() in one]
-    if len(kernels) == 1 and stubs:
-        _write(stubs[0], kernels[0])
-    # Two kernel files are the kernel and its stub, already replaced by another process.
-    return bool(kernels and (stubs or kernels[1:]))
+def _link(key: str, name: str, folder: Path) -> None:
+    """Replace the file of a stub by that of the kernel of this name which was used when the stub was compiled.
+
+    Taichi records uses, in seconds, when it writes what the process compiled; a stub is compiled before its kernel is
+    found. If a kernel of other sources was used as well, the stub stays.
+    """
+    files = _files_of_taichi(folder)
+    for stub, size, compiled, _ in files:
+        if size < STUB_BYTES and f"stub_{key}".encode() in stub.read_bytes():
+            recent = (path.read_bytes() for path, _, _, used in files if used >= compiled)
+            kernels = {content for content in recent if name.encode() in content}
+            if len(kernels) == 1 and _is_sound(*kernels):
+                _write(stub, *kernels)
+
+
+def _files_of_taichi(folder: Path) -> list[tuple[Path, int, int, int]]:
+    """Return the files of Taichi: path, bytes, and the times of creation and of the last recorded use, s."""
+    content = (folder / LIST).read_bytes()
+    if (len(content) - LIST_HEAD.size) % ENTRY.size:
+        return []
+    rows = ENTRY.iter_unpack(content[LIST_HEAD.size :])
+    found = [(folder / f"{name.decode()}.tic", created, used) for _, _, _, name, _, created, used in rows]
+    return [(path, path.stat().st_size, created, used) for path, created, used in found if path.exists()]
 
 
 def _is_sound(content: bytes) -> bool:

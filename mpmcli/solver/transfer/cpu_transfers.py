@@ -7,6 +7,7 @@ whole. The sum of a node is therefore a sum over tiles in fixed order, for any n
 
 from mpmcli.quick_taichi import ti
 from mpmcli.solver.particles.arrays import CONSTANTS, VOLUME
+from mpmcli.solver.particles.sort import stay_rolled
 from mpmcli.solver.particles.state_bounds import NOTHING, volume_ratio
 from mpmcli.solver.transfer.lanes import (
     LANES,
@@ -171,6 +172,7 @@ def store_projected(
     else:
         for lane in range(count):
             p = begin + lane
+            stay_rolled(group.id, p)
             if ratios[lane] > SMALLEST_J:
                 if ti.static(keeps_F):
                     for i, j in ti.static(ti.ndrange(d, d)):
@@ -306,6 +308,7 @@ def advance_range(
         else:
             for lane in range(count):
                 p = begin + lane
+                stay_rolled(particles.lost, p)
                 for c in ti.static(range(d)):
                     group.v[p][c] = speeds[c, lane]
                     for a in ti.static(range(d)):

@@ -21,6 +21,7 @@ from mpmcli.scene.sampling import points_per_cell
 from mpmcli.solver.grid.grid import Grid, LinearNodes
 from mpmcli.solver.grid.sparse_grid import BlockNodes, SparseGrid
 from mpmcli.solver.particles.arrays import MASS, VOLUME
+from mpmcli.solver.particles.sort import stay_rolled
 from mpmcli.solver.transfer.lanes import (
     LANES,
     load_entry,
@@ -147,6 +148,7 @@ def fill_fine(at: ti.template(), p: int, time: float):
 def fill_range(at: ti.template(), first: int, last: int, time: float):
     """Add the volumes of particles first to last - 1 to fine nodes."""
     for p in range(first, last):
+        stay_rolled(at.order.buffers.real, p)
         fill_fine(at, p, time)
 
 
@@ -268,6 +270,7 @@ def shift_lanes(at: ti.template(), first: int, last: int, time: float, back: ti.
                 for a in ti.static(range(d)):
                     distances[a, lane] = distance[a]
         for lane in range(count):
+            stay_rolled(at.order.buffers.real, first_node[lane])
             if ti.static(back):
                 w = weights_of(weights, nodes, d, lane)
                 mean, _ = gather_linear(grid.nodes, grid, first_node[lane], w)
@@ -295,11 +298,13 @@ def shift_lanes(at: ti.template(), first: int, last: int, time: float, back: ti.
                 store_lanes(group.v, (a,), origin, v, a)
         else:
             for lane in range(count):
+                stay_rolled(at.order.buffers.real, first_node[lane])
                 for a in ti.static(range(d)):
                     group.x[begin + lane][a] = x[a, lane]
                     group.v[begin + lane][a] = v[a, lane]
         if ti.static(not back):
             for lane in range(count):
+                stay_rolled(at.order.buffers.real, first_node[lane])
                 w = weights_of(weights, nodes, d, lane)
                 add_shift(at, first_node[lane], w, masses[lane], vector_of(ways, 0, d, lane))
         begin += LANES
