@@ -1,5 +1,7 @@
 """The table of what kernels cost: every law is in it, costs add up, and the cheaper kernels are taken."""
 
+from pathlib import Path
+
 import pytest
 from good_scene import GOOD, load
 from solver_state import scene_of
@@ -52,7 +54,8 @@ def test_a_step_costs_as_many_particles_as_there_are(d: int) -> None:
     assert max(one.compile, sand.compile) < both.compile < one.compile + sand.compile
 
 
-def test_what_stands_beside_costs_more() -> None:
+def test_what_stands_beside_costs_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
     plain = cost_of(load(GOOD).scene, "most")
     for text in (GOOD + JET, GOOD + POST, GOOD + POST + "density = 1000.0\n"):
         cost = cost_of(load(text).scene, "most")
