@@ -23,7 +23,7 @@ ROOT = Path(__file__).resolve().parent.parent
 # Kernels compile inside examples and machines are shared: time says nothing about correctness.
 # A run of the suite tries the same examples each time; `--hypothesis-profile random` tries others.
 settings.register_profile("random", deadline=None, max_examples=50, print_blob=True)
-settings.register_profile("mpmcli", settings.get_profile("random"), derandomize=True)
+settings.register_profile("mpmcli", settings.get_profile("random"), derandomize=True, max_examples=25)
 settings.load_profile("mpmcli")
 
 # The backend of tests marked gpu; scripts/gpu sets it to that of the device.
@@ -147,7 +147,7 @@ def record_property(record_property: Callable[[str, object], None]) -> Callable[
 
 @pytest.fixture(scope="session")
 def backend_of() -> "Iterator[Callable[..., Backend]]":
-    """Return `start(precision, threads=2, arch="cpu", fully_optimised=False)`, which replaces the running backend.
+    """Return `start(precision, threads=1, arch="cpu", fully_optimised=False)`, which replaces the running backend.
 
     Taichi is global: whatever was built on the backend before dies with it, so a module starts one and
     builds its runs on it, or keeps no run from one test to the next.
@@ -158,7 +158,7 @@ def backend_of() -> "Iterator[Callable[..., Backend]]":
     """
     from mpmcli.solver.machine.backend import start_backend, stop_backend
 
-    def start(precision: str, threads: int = 2, arch: str = "cpu", *, fully_optimised: bool = False) -> "Backend":
+    def start(precision: str, threads: int = 1, arch: str = "cpu", *, fully_optimised: bool = False) -> "Backend":
         stop_backend()
         arch = GPU if arch == "vulkan" else arch
         with pytest.MonkeyPatch.context() as patch:

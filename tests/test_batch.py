@@ -102,9 +102,8 @@ def rigid(dimension: int, k: int) -> list[dict]:
 
 
 # In the default suite, with the runs that are repeated alone: the second is smaller than what the batch has room for.
-# All others, and the first runs of these, carry the marker slow. Colliders are rough, as is the wall that moves.
+# All others, and the first runs of these, carry the marker slow.
 USUAL = {
-    "colliders": (1,),
     "two laws, two bodies of one": (1,),
     "rigid bodies": (1,),
 }

@@ -54,6 +54,7 @@ def test_runs_follow_those_on_the_cpu(backend_of: Callable, name: str) -> None:
             assert np.array_equal(frame.body, other.body) and np.array_equal(frame.material, other.material)
 
 
+@pytest.mark.slow
 def test_an_unstable_run_stops_alone(backend_of: Callable) -> None:
     sound = scene_named("neo_hookean")
     time = sound.time.model_copy(update={"step": 0.004, "end": 0.4})

@@ -54,7 +54,9 @@ def test_an_example_is_changed_in_its_settings_alone(case: BenchCase) -> None:
         peers.adapted_source(text.replace("n_particles = ", "particle_count = "), case, 3, "cpu", "f64")
 
 
-@pytest.mark.parametrize("case", [SMALL_2D, pytest.param(SMALL_3D, marks=pytest.mark.slow)], ids=lambda case: case.peer)
+@pytest.mark.parametrize(
+    "case", [pytest.param(case, marks=pytest.mark.slow) for case in (SMALL_2D, SMALL_3D)], ids=lambda case: case.peer
+)
 def test_both_move_alike(case: BenchCase, run_python: Callable, tmp_path: Path) -> None:
     """The same physics: from the same block, before a wall is in reach, both give the same positions.
 
@@ -223,6 +225,7 @@ def test_the_profile() -> None:
     assert run_here("bench", "--profile", "--seconds", "0.8").stdout.count("\n2d-64") == len(laws()) + 1
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("clocks")
 def test_the_sweeps_are_stored_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two rounds of a trajectory with three frames; the ratio is to what the generator would take here."""

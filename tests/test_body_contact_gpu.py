@@ -70,6 +70,7 @@ def test_contact_on_a_gpu_follows_that_on_the_cpu(backend_of: Callable, dimensio
     assert extremes == pytest.approx(expected_extremes, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_runs_of_a_batch_do_what_they_do_alone(backend_of: Callable) -> None:
     """Each with friction of its own."""
     scenes = [scene(2), scene(2, friction=0.0)]

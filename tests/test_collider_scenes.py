@@ -51,7 +51,7 @@ def test_water_in_a_mesh_rests_as_in_a_box(backend_of: Callable, tmp_path: Path,
         loads = [-row.collider_force[0][2] for _, row in frames[3:]] if colliders else [frames[0][1].mass * G]
         return float(height), float(np.mean(loads))
 
-    backend = backend_of("f32", 2)
+    backend = backend_of("f32")
     meshed = rest([{"name": "c", "side": "inside", "shape": {"mesh": {"file": box}}}], 1.0, low)
     form = {"box": {"min": [low] * 3, "max": [high] * 3}}
     formed = rest([{"name": "c", "side": "inside", "shape": form}], 1.0, low)
@@ -79,7 +79,7 @@ def test_a_ball_rolls_down_a_mesh(backend_of: Callable, tmp_path: Path, record_p
         bodies=[{"name": "ball", "material": jelly, "shape": {"ball": {"center": center, "radius": radius}}}],
         colliders=[{"name": "ramp", "shape": {"mesh": {"file": ramp}}, "friction": 0.8}],
     )
-    frames = run(scene, backend_of("f32", 2))
+    frames = run(scene, backend_of("f32"))
     gaps = np.array([((frame.position[:, ::2] - surface[0]) @ normal).min() / h for frame, _ in frames])
     record_property("gaps, cells", gaps.round(2).tolist())
     assert (gaps[1:] > -0.3).all() and (gaps[1:] < 1.5).all()

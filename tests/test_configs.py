@@ -13,12 +13,17 @@ from mpmcli.scene import load_scene
 from mpmcli.scene.expand import PRESETS
 
 SCENES = sorted(CONFIGS.glob("*.toml"))
-# In 3D each has a twin in 2D of the same materials, and other scenes run in 3D. The dam break is the demo that
-# test_docs.py runs, and the drop and the obstacle are validation cases. The laws of mixed_2d run alone, and
-# test_check_result.py runs two.
-SLOW = {
-    *(f"{name}_3d" for name in ("dam_break_obstacle", "jelly_drop", "jelly_stack", "mesh_drop", "sand_column", "silo")),
-    *("crater_3d", "dam_break_2d", "elliptical_drop_2d", "mixed_2d", "snowball_wall_3d"),
+# Those that run by default: a fluid in 3D, an emitter, a rigid body on a hinge, contact of surfaces, sand on colliders,
+# snow, a yield stress, and the scene that test_docs.py runs. Other tests run the other laws and features.
+USUAL = {
+    "couette_2d",
+    "dam_break_3d",
+    "fountain_2d",
+    "mud_slump_2d",
+    "paddle_wheel_2d",
+    "sand_obstacles_2d",
+    "snowball_wall_2d",
+    "stack_2d",
 }
 
 
@@ -95,7 +100,7 @@ def test_a_config_says_how_many_particles_it_has(path):
 
 
 @pytest.mark.parametrize(
-    "path", [pytest.param(path, id=path.stem, marks=[pytest.mark.slow] * (path.stem in SLOW)) for path in SCENES]
+    "path", [pytest.param(path, id=path.stem, marks=[pytest.mark.slow] * (path.stem not in USUAL)) for path in SCENES]
 )
 def test_a_config_runs(path, tmp_path):
     """A few steps to the first frames, which land on their times; nothing is lost; only what moves makes energy."""

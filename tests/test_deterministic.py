@@ -171,7 +171,7 @@ def test_momentum_is_kept_to_the_rounding_of_the_sums(backend_of: Callable) -> N
         for b in sample_bodies(scene)
     ]
     still = scene.model_copy(update={"domain": domain})
-    run = build_run(still, on_gpu_path(backend_of("f64", 3)), lifted)
+    run = build_run(still, on_gpu_path(backend_of("f64")), lifted)
     before = momentum_of(run)
     for _ in range(20):
         run.step(1e-3)
@@ -208,7 +208,7 @@ def test_what_the_sums_have_no_room_for_stops_the_run(backend_of: Callable) -> N
     Sums have room for DENSEST to twice as many times the mass of a full cell.
     """
     assert 2 * DENSEST < 0.75**2 * 256
-    run = build_run(lone_pool(), on_gpu_path(backend_of("f32", 2)))
+    run = build_run(lone_pool(), on_gpu_path(backend_of("f32")))
     (group,), begin = run.groups, run.save().copied()
     run.step(1e-3)
     state = group.read()
@@ -227,7 +227,7 @@ def test_what_the_sums_have_no_room_for_stops_the_run(backend_of: Callable) -> N
 
 def test_on_the_cpu_nothing_changes(backend_of: Callable) -> None:
     """The same bytes, plan and fields."""
-    backend = backend_of("f32", 2)
+    backend = backend_of("f32")
     with_it, without = (mixed(2, (WATER,), deterministic=asked) for asked in (True, False))
     assert make_plan(with_it, backend) == make_plan(without, backend)
     run = build_run(with_it, backend)
@@ -237,7 +237,7 @@ def test_on_the_cpu_nothing_changes(backend_of: Callable) -> None:
 
 def test_a_gpu_without_it_has_nothing_of_it(backend_of: Callable) -> None:
     """And with it a node needs 8 bytes a number more, in place of the means of volume."""
-    backend = on_gpu_path(backend_of("f32", 2))
+    backend = on_gpu_path(backend_of("f32"))
     plain, asked = (mixed(2, (JELLY,), deterministic=asked) for asked in (False, True))
     assert build_run(plain, backend).grid.fixed is None
     grid = build_run(asked, backend).grid
@@ -247,13 +247,14 @@ def test_a_gpu_without_it_has_nothing_of_it(backend_of: Callable) -> None:
     assert [name for name in passes if name not in make_plan(plain, backend).passes] == ["read sums in fixed point"]
 
 
+@pytest.mark.slow
 def test_deterministic_runs_of_a_batch_have_the_bytes_that_they_have_alone(backend_of: Callable) -> None:
     """Two runs on the path of a GPU, in which all numbers differ: each has scales of its own."""
     scenes = [scene_named("sand"), scene_named("sand", other=True)]
     scenes = [
         scene.model_copy(update={"solver": scene.solver.model_copy(update={"deterministic": True})}) for scene in scenes
     ]
-    backend = on_gpu_path(backend_of("f32", 2))
+    backend = on_gpu_path(backend_of("f32"))
     found = outputs_of(batch_of(scenes, backend), scenes)
     for output, scene in zip(found, scenes, strict=True):
         assert list(same(output, list(build_run(scene, backend).frames()))) == []

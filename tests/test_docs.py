@@ -50,15 +50,20 @@ SHORTER = {
 }
 # scripts/test is what runs this test.
 NOT_RUN = {"scripts/test"}
-# These are run with -m slow: a minute of compiling each law, the bar that test_validate_cli.py validates, the benchmark
-# of test_bench.py, and the parts that test_docs_datasets.py computes and merges.
+# These are run with -m slow: kernels in f64, the report of a GPU, and what other files test (test_bench.py,
+# test_docs_datasets.py, test_validate_cli.py, test_warm.py).
 SLOW = {
+    "mpmcli bench > results/bench.txt",
     "mpmcli bench --dataset > results/dataset.txt",
     "mpmcli bench --profile > results/profile.txt",
     "mpmcli sweep drops.toml --count 4 -o results/part-1 --shard 1/2",
     "mpmcli dataset merge results/part-1 -o results/merged",
     "mpmcli validate bar_fixed_free --levels coarse -o results/bar",
     "mpmcli validate conservation --levels coarse",
+    "mpmcli warm configs/dam_break_2d.toml",
+    "scripts/gpu --arch cpu --parts runs --out results/gpu",
+    "mpmcli simulate drop.toml -o results/series --set time.frames=4 --format vtk --precision f64 --quiet --json "
+    "> series.json",
 }
 
 
@@ -172,18 +177,22 @@ def test_every_slow_command_runs(checkout):
     done = run_commands(checkout, slow=True)
     assert set(done) == SLOW
     assert not failed(done)
-    assert "1 of 1" in (checkout / "results" / "dataset.txt").read_text(encoding="utf-8")
+    results = checkout / "results"
+    assert "1 of 1" in (results / "dataset.txt").read_text(encoding="utf-8")
+    assert open_result(results / "series" / "particles.pvd").frame_count == 5
+    summary = json.loads((checkout / "series.json").read_text(encoding="utf-8"))
+    assert summary["status"] == "finished" and summary["backend"]["precision"] == "f64"
+    # The table of the bench has the head of the page's.
+    head = next(line for line in PAGES["docs/performance.md"].splitlines() if line.startswith("case "))
+    assert (results / "bench.txt").read_text(encoding="utf-8").splitlines()[2].split() == head.split()
 
 
 def test_the_commands_make_what_the_readme_says(commands, checkout):
     demo = open_result(checkout / "results" / "dam_break_2d" / "particles.vtkhdf")
     assert demo.frame_count == 6
     assert "results/dam_break_2d/particles.vtkhdf" in commands["scripts/demo"].stdout
-    assert open_result(checkout / "results" / "series" / "particles.pvd").frame_count == 5
     assert open_result(checkout / "results" / "faster").times[-1] == 0.4
     assert commands["python load.py"].stdout.splitlines()[0].startswith("1 (51, ")
-    summary = json.loads((checkout / "series.json").read_text(encoding="utf-8"))
-    assert summary["status"] == "finished" and summary["backend"]["precision"] == "f64"
     assert json.loads((checkout / "scene.schema.json").read_text(encoding="utf-8"))["title"] == "Scene"
     assert sorted(path.name for path in (checkout / "results" / "drop").iterdir()) == [
         "ledger.png",
@@ -319,10 +328,3 @@ def test_a_section_is_replaced_between_its_markers(scripts, tmp_path):
     assert file.read_text(encoding="utf-8") == "before\n<!-- t: by hand -->\nnew\n\nlines\n<!-- end of t -->\nafter\n"
     with pytest.raises(ValueError, match="needs one <!-- u"):
         replace_section("u", "new", file)
-
-
-def test_the_table_of_the_bench_is_that_of_the_page(commands, checkout):
-    """The command of the page writes a table with the head of the page's."""
-    head = next(line for line in PAGES["docs/performance.md"].splitlines() if line.startswith("case "))
-    written = (checkout / "results" / "bench.txt").read_text(encoding="utf-8").splitlines()[2]
-    assert written.split() == head.split()

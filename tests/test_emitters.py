@@ -146,6 +146,7 @@ def test_the_jet_leaves_as_if_nothing_were_there(
     assert row.linear_momentum[0] == pytest.approx(SPEED * (row.emitted_mass - row.retired_mass), rel=1e-5)
 
 
+@pytest.mark.slow
 def test_a_jet_needs_no_body(backend_of: Callable[..., Backend], jet: Output) -> None:
     """Emitters alone are a scene, and the jet does not know of the pool that it never meets: the same, to the byte."""
     scene = jet_scene(bodies=[])
@@ -195,13 +196,14 @@ def test_all_runs_of_a_batch_do(backend_of: Callable[..., Backend]) -> None:
     assert list(same(together, found[1])) == []
 
 
+@pytest.mark.slow
 def test_runs_of_a_batch_on_the_path_of_a_gpu_follow_those_on_the_cpu(backend_of: Callable[..., Backend]) -> None:
     """As many particles come in at every frame, and the jet is where it is on the CPU."""
     scenes = [mixed_scene(), mixed_scene(other=True)]
-    found = outputs_of(batch_of(scenes, on_gpu_path(backend_of("f32", 2))), scenes)
+    found = outputs_of(batch_of(scenes, on_gpu_path(backend_of("f32"))), scenes)
     for output, scene in zip(found, scenes, strict=True):
         # The second run finds the stored kernel of the first one.
-        expected = list(build_run(scene, backend_of("f32", 2)).frames())
+        expected = list(build_run(scene, backend_of("f32")).frames())
         for (frame, row), (other, other_row) in zip(output, expected, strict=True):
             assert (row.emitted, row.blocked) == (other_row.emitted, other_row.blocked)
             # When a sort retires what is beyond a face differs, in double precision too; it bounds steps until then.

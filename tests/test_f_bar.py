@@ -51,7 +51,8 @@ def shared(x: np.ndarray, F: np.ndarray, volume: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("dimension", "solids"), [(2, "updated"), (2, "total"), pytest.param(3, "updated", marks=pytest.mark.slow)]
+    ("dimension", "solids"),
+    [(2, "updated"), *(pytest.param(*how, marks=pytest.mark.slow) for how in ((2, "total"), (3, "updated")))],
 )
 def test_steps_are_those_of_plain_numpy(backend_of: Callable, dimension: int, solids: str) -> None:
     """Stress of F with the mean of ln J of the cell, the one at rest where bodies are on the grid at rest.
@@ -168,6 +169,7 @@ def test_a_ball_that_bounces_gains_no_energy(backend_of: Callable, law: str, rat
     assert energy[-1] < 0.95 * energy[0]
 
 
+@pytest.mark.slow
 def test_a_uniform_change_of_volume_is_not_changed(backend_of: Callable) -> None:
     """Where all particles have one J the mean is J, and the run is that without averaging, to round-off."""
 
@@ -216,6 +218,7 @@ def test_a_gpu_follows_the_cpu(backend_of: Callable, solids: str) -> None:
             assert np.abs(frame.fields["pressure"] - other.fields["pressure"]).max() < 5e-3 * scale
 
 
+@pytest.mark.slow
 def test_threads_change_no_byte(backend_of: Callable) -> None:
     """Frames included, which average once more."""
     scene = block(solver={"precision": "f32"}, end=0.05)

@@ -82,9 +82,9 @@ def check_steps(scene: Scene, arrays: Arrays, tolerance: float) -> None:
     ids=name_of,
 )
 def test_steps_match_plain_numpy(backend_of: Callable, dimension: int, knobs: dict) -> None:
-    """Six steps on two threads in double precision, each from the device's own state, to round-off."""
+    """Six steps in double precision, each from the device's own state, to round-off."""
     scene = scene_of(dimension, "f64", knobs)
-    check_steps(scene, path_run.record_steps(prepare(scene, backend_of("f64", 2))), TOLERANCE["f64"])
+    check_steps(scene, path_run.record_steps(prepare(scene, backend_of("f64"))), TOLERANCE["f64"])
 
 
 @pytest.mark.gpu

@@ -80,6 +80,7 @@ def small_run(backend: Backend) -> tuple[np.ndarray, list]:
     return found[-1][0].position, [row for _, row in found]
 
 
+@pytest.mark.slow
 def test_threads_change_no_byte(backend_of: Callable) -> None:
     expected, rows = small_run(backend_of("f32", 1))
     found, own = small_run(backend_of("f32", 3))

@@ -105,6 +105,7 @@ def test_sand_stays_on_a_gentle_slope_and_flows_on_a_steep_one(
         assert np.array(ratios[1:]) == pytest.approx(strength, rel=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("beyond", [4.0, -4.0], ids=["rough", "smooth"])
 def test_sand_stays_on_a_rough_floor_and_slides_on_a_smooth_one(
     backend_of: Callable, beyond: float, record_property: Callable

@@ -46,7 +46,7 @@ def two_blocks(dimension: int, end: float, solids: str = "updated") -> Scene:
         (2, "updated", "cpu", 5.0),
         pytest.param(2, "total", "cpu", 1.0, marks=pytest.mark.slow),
         pytest.param(3, "updated", "cpu", 5.0, marks=pytest.mark.slow),
-        pytest.param(2, "updated", "vulkan", 0.1, marks=pytest.mark.gpu),
+        pytest.param(2, "updated", "vulkan", 0.1, marks=[pytest.mark.gpu, pytest.mark.slow]),
     ],
 )
 def test_a_slow_block_beside_a_fast_one(

@@ -151,27 +151,28 @@ def random_state(run: Run, clear: float = 0.0) -> tuple[list[np.ndarray], list[n
 
 
 KINDS = {
+    "2D, beside jelly": ({"default": "slip"}, {"materials": (WATER, JELLY)}),
     "2D": ({"default": "separate", "y_max": "stick"}, {}),
     "periodic, two laws": ({"default": "slip", "x_min": "periodic", "x_max": "periodic"}, {"materials": (SAND, WATER)}),
     "open, cubic, 9 a cell": ({"default": "slip", "x_max": "open"}, {"kernel": "cubic", "per_cell": 9}),
     "3D, beside jelly": ({"default": "slip", "y_max": "open"}, {"dimension": 3, "materials": (WATER, JELLY)}),
 }
 
+USUAL = {("2D, beside jelly", "cpu"), ("3D, beside jelly", "cpu"), ("periodic, two laws", "gpu in fixed point")}
+
 
 @pytest.mark.parametrize(
     ("kind", "path"),
     [
-        *((kind, "cpu") for kind in KINDS),
-        *(
-            pytest.param(kind, "gpu in fixed point", marks=[pytest.mark.slow] * (kind != "periodic, two laws"))
-            for kind in KINDS
-        ),
+        pytest.param(kind, path, marks=[pytest.mark.slow] * ((kind, path) not in USUAL))
+        for path in ("cpu", "gpu in fixed point")
+        for kind in KINDS
     ],
 )
 def test_a_shift_is_that_of_its_formulas(backend_of: Callable, kind: str, path: str) -> None:
     """To the rounding of places, and of sums in fixed point."""
     walls, options = KINDS[kind]
-    backend = backend_of("f64", 2)
+    backend = backend_of("f64", 1)
     scene = crowded(walls, deterministic=path != "cpu", **options)
     run = build_run(scene, backend if path == "cpu" else on_gpu_path(backend))
     laws = [group.law for group in run.groups]
@@ -326,20 +327,27 @@ def test_two_liquids_have_no_crowds(backend_of: Callable) -> None:
     assert energy > lost
 
 
+@pytest.mark.slow
 def test_runs_have_the_same_bytes_alone_and_together(backend_of: Callable) -> None:
-    """On any number of threads, in a batch, and gone on with from the middle of an interval."""
+    """In a batch, on two threads."""
     scenes = [column(redistribute="auto", sampling=sampling) for sampling in ("lattice", "jittered")]
     alone = [list(build_run(scene, backend_of("f64", 1)).frames()) for scene in scenes]
     for found, expected in zip(outputs_of(batch_of(scenes, backend_of("f64", 2)), scenes), alone, strict=True):
         assert list(same(found, expected)) == []
-    run = build_run(scenes[1], backend_of("f64", 3))
+
+
+def test_a_run_that_goes_on_has_the_same_bytes(backend_of: Callable) -> None:
+    """On three threads as on one, and gone on with from the middle of an interval."""
+    scene = column(redistribute="auto", sampling="jittered")
+    alone = list(build_run(scene, backend_of("f64", 1)).frames())
+    run = build_run(scene, backend_of("f64", 3))
     stepped = run.frames()
     first = [next(stepped), next(stepped)]
     assert 0 < run.state.unrelaxed_steps < INTERVAL - 1
     saved = run.save().copied()
-    assert list(same(first + list(stepped), alone[1])) == []
+    assert list(same(first + list(stepped), alone)) == []
     run.load(saved)
-    assert list(same(first + list(run.frames()), alone[1])) == []
+    assert list(same(first + list(run.frames()), alone)) == []
 
 
 def far_apart(dimension: int, grid: str) -> Scene:
@@ -359,12 +367,13 @@ def far_apart(dimension: int, grid: str) -> Scene:
     )
 
 
-@pytest.mark.parametrize("dimension", [2, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("dimension", [2, 3])
 def test_a_sparse_grid_shifts_as_a_dense_one(backend_of: Callable, dimension: int) -> None:
     """Over several intervals, with images behind walls and across the domain in blocks of their own, to rounding."""
     found = []
     for grid in ("dense", "sparse"):
-        run = build_run(far_apart(dimension, grid), backend_of("f64", 2))
+        run = build_run(far_apart(dimension, grid), backend_of("f64"))
         assert run.batch.device.grid.sparse == (grid == "sparse")
         found.append([frame for frame, _ in run.frames()][-1])
     assert found[0].step == found[1].step > 2 * INTERVAL
@@ -379,7 +388,7 @@ def test_a_gpu_shifts_as_the_cpu_does(backend_of: Callable) -> None:
     scene = scene.model_copy(update={"time": scene.time.model_copy(update={"end": 0.1})})
     settings = scene.solver.model_copy(update={"precision": "f32", "deterministic": True})
     scene = scene.model_copy(update={"solver": settings})
-    expected = list(build_run(scene, backend_of("f32", 2)).frames())[-1][0]
+    expected = list(build_run(scene, backend_of("f32")).frames())[-1][0]
     assert expected.step > 2 * INTERVAL
     first, second = twice(scene, backend_of("f32", 1, "vulkan"))
     assert list(same(first, second)) == []

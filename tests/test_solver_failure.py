@@ -78,7 +78,7 @@ def run_until_lost(run: Run, steps: int = 40) -> UnstableRunError:
 
 @pytest.fixture(scope="module")
 def backend(backend_of: Callable) -> Backend:
-    return backend_of("f32", 2)
+    return backend_of("f32")
 
 
 @pytest.fixture(scope="module")

@@ -63,7 +63,7 @@ def tumbling() -> Scene:
 @pytest.fixture(scope="module")
 def run(backend_of: Callable) -> Run:
     """Return the run of the tumbling scene, after all of its frames."""
-    return build_run(tumbling(), backend_of("f64", 2))
+    return build_run(tumbling(), backend_of("f64"))
 
 
 @pytest.fixture(scope="module")
@@ -273,7 +273,7 @@ def test_a_step_given_in_the_scene_is_a_maximum(backend_of: Callable) -> None:
     data = tumbling().model_dump()
     data["time"] |= {"step": 1e-3, "end": 0.01, "frames": 3}
     del data["domain"]["cells"]
-    rows = [row for _, row in build_run(scene_of(**data), backend_of("f64", 2)).frames()]
+    rows = [row for _, row in build_run(scene_of(**data), backend_of("f64")).frames()]
     assert [row.steps for row in rows[1:]] == [4, 4, 4]
     assert all(row.step_max <= 1e-3 * (1 + 1e-6) for row in rows)
     assert all(row.limit == "maximum" for row in rows[1:])
@@ -288,8 +288,7 @@ def test_energies_of_bodies_at_rest(backend_of: Callable) -> None:
     for body in data["bodies"]:
         body["velocity"] = [0.0, 0.0]
         body["velocity_gradient"] = None
-    data["solver"]["precision"] = "f32"
-    run = build_run(scene_of(**data), backend_of("f32", 2))
+    run = build_run(scene_of(**data), backend_of("f64"))
     start = bodies_of(run)
     for _ in range(500):
         run.step(2e-3)

@@ -270,7 +270,7 @@ def uncorrected(tables: dict) -> Scene:
 @pytest.mark.parametrize(
     ("name", "least"),
     [
-        ("toss", 0.3),
+        pytest.param("toss", 0.3, marks=pytest.mark.slow),
         pytest.param("sand_toss", 0.3, marks=pytest.mark.slow),
         pytest.param("dam_at_rest", 0.05, marks=pytest.mark.slow),
         pytest.param("stirred_pool", 0.05, marks=pytest.mark.slow),

@@ -66,11 +66,11 @@ def test_a_bar_meets_a_wall_where_it_is(backend_of: Callable, way: str, shift: f
     assert 0.93 < moves[-1] < 1.0
 
 
-@pytest.mark.parametrize("way", ["wall", "plane"])
+@pytest.mark.parametrize("way", ["wall", pytest.param("plane", marks=pytest.mark.slow)])
 def test_nothing_passes_at_the_speed_of_waves(backend_of: Callable, way: str) -> None:
     """What is too fast for the spring of contact is stopped less than a cell behind; no energy is made."""
     asked = falling(way, 0.3, 16, 1.0)
-    frames = list(build_run(asked, backend_of("f32", 1)).frames())
+    frames = list(build_run(asked, backend_of("f64", 1)).frames())
     floor = 0.0 if way == "wall" else 5.3 * H
     assert min(frame.position[:, 1].min() for frame, _ in frames) > floor - 0.75 * H
     assert frames[-1][0].velocity[:, 1].mean() > 0.2 * C
@@ -78,7 +78,7 @@ def test_nothing_passes_at_the_speed_of_waves(backend_of: Callable, way: str) ->
     assert energy.max() <= energy[0] * (1 + 1e-6)
 
 
-@pytest.mark.parametrize("way", ["wall", "plane"])
+@pytest.mark.parametrize("way", ["wall", pytest.param("plane", marks=pytest.mark.slow)])
 def test_what_shows_no_surface_is_stopped(backend_of: Callable, way: str) -> None:
     """As what was torn or crushed, it is stopped within a cell, and flies back."""
     run = build_run(falling(way, 0.3, 8, 0.1), backend_of("f64", 1))
@@ -113,10 +113,14 @@ def turned_block(way: str, degrees: float, friction: float, shift: float, time: 
     ("way", "degrees", "friction", "off"),
     [
         ("wall", 0.0, 0.3, 3e-3),
-        ("wall", 0.0, 0.0, 1e-3),
         *(
             pytest.param(*how, marks=pytest.mark.slow)
-            for how in (("plane", 0.0, 0.3, 3e-3), ("box", 17.0, 0.3, 5e-3), ("plane", 17.0, 0.0, 2e-3))
+            for how in (
+                ("wall", 0.0, 0.0, 1e-3),
+                ("plane", 0.0, 0.3, 3e-3),
+                ("box", 17.0, 0.3, 5e-3),
+                ("plane", 17.0, 0.0, 2e-3),
+            )
         ),
     ],
 )
@@ -158,7 +162,7 @@ def test_a_disc_rolls_or_slides_down_a_wall(backend_of: Callable, friction: floa
         assert -turning * r * H / (2 * G * math.cos(slope)) == pytest.approx(0.05, rel=0.08)
 
 
-@pytest.mark.parametrize("way", ["wall", "box"])
+@pytest.mark.parametrize("way", [pytest.param("wall", marks=pytest.mark.slow), "box"])
 def test_a_belt_carries_a_block(backend_of: Callable, way: str) -> None:
     """It slides with mu g until it has the velocity of the belt, and keeps that."""
     friction, pace = 0.4, 0.8
@@ -211,13 +215,13 @@ def test_jelly_stays_out_of_a_wedge(backend_of: Callable) -> None:
 def test_the_ledger_lacks_a_part_of_the_energy_of_contact(backend_of: Callable) -> None:
     """What it seems to gain while a block of 10 cells swings on a floor is less than `check` allows for contact."""
     block = body("block", [10, 0], [25, 10])
-    asked = scene([block], end=0.5, frames=50, domain={"walls": "separate", "gravity": [0.0, -G]})
+    asked = scene([block], end=0.5, frames=50, domain={"walls": "separate", "friction": 0.3, "gravity": [0.0, -G]})
     rows = [row for _, row in build_run(asked, backend_of("f64", 1)).frames()]
     parts = (np.array([getattr(row, name) for row in rows]) for name in ("kinetic", "potential", "elastic"))
     assert energy_change(*parts)[0].max() < 0.8 * CONTACT_SUSPECT
 
 
-@pytest.mark.parametrize("way", ["wall", "plane"])
+@pytest.mark.parametrize("way", ["wall", pytest.param("plane", marks=pytest.mark.slow)])
 def test_jelly_rests_on_the_floor(backend_of: Callable, way: str) -> None:
     """Its lowest row is as far above it as when surfaces touch, 0.03 cells off; 0.15 at its corners.
 

@@ -13,6 +13,7 @@ import numpy as np
 from mpmcli.boundaries.distances import DISTANCES, BoxDistance, GridDistance, samples_of
 from mpmcli.boundaries.doubles import double_field
 from mpmcli.boundaries.loads import Loads
+from mpmcli.boundaries.rows import Rows
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
 from mpmcli.scene.colliders import Collider
@@ -170,38 +171,50 @@ class Colliders:
         # Velocity of the pivot, m/s, and (R' - I) / dt, R' the rotation in a step, 1/s.
         self.velocity = ti.Vector.field(d, float, shape=n)
         self.turning = ti.Matrix.field(d, d, float, shape=n)
-        self.count = ti.field(int, shape=runs)
+        self.count, self._counts = ti.field(int, shape=runs), [0] * runs
+        self._write_count = Rows(self.count).write
+        columns = [self.form, self.wall, self.begin, self.side, self.friction, self.lets, self.place, self.turned]
+        columns += [self.reach, self.velocity, self.turning] + ([self.sample] if self.grids else [])
+        self._write_rows = Rows(*columns).write
         self.deterministic = deterministic
         self.given = ti.Vector.field(d, float, shape=n * math.prod(shape)) if deterministic else None
 
     def write(self, scene: Scene, run: int = 0) -> None:
         """Set the colliders of a run, at time 0."""
         h, origin = scene.domain.spacing, np.array(scene.domain.origin)
-        self.count[run] = len(scene.colliders)
+        self._counts[run] = len(scene.colliders)
+        self._write_count(run, [len(scene.colliders)])
         used, sampled = run * self.kind.numbers, run * self.kind.samples
-        for k, collider in enumerate(scene.colliders):
-            i = run * self.capacity + k
+        rows, still = [], np.zeros((self.dimension, self.dimension))
+        for collider in scene.colliders:
             numbers = numbers_of(collider, h)
             self._write_numbers(used, np.array(numbers, self.real))
+            place, turned = collider.motion.pose(0.0)
+            held = [int(collider.axes is not None and axis not in collider.axes) for axis in AXES[: self.dimension]]
+            side = -1 if collider.side == "inside" else 1
+            row = [
+                form_code(collider),
+                WALLS[collider.wall],
+                used,
+                side,
+                collider.friction,
+                held,
+                place - origin,
+                turned,
+            ]
+            rows.append([*row, reach_of(collider, h), still[0], still] + ([sampled] if self.grids else []))
+            used += len(numbers)
             if form_code(collider) == GRID:
                 values = samples_of(collider.form, h)[0].ravel()
                 self._write_samples(sampled, values)
-                self.sample[i] = sampled
                 sampled += values.size
-            self.form[i], self.wall[i], self.begin[i] = form_code(collider), WALLS[collider.wall], used
-            self.side[i] = -1 if collider.side == "inside" else 1
-            self.friction[i] = collider.friction
-            self.lets[i] = [
-                int(collider.axes is not None and axis not in collider.axes) for axis in AXES[: self.dimension]
-            ]
-            used += len(numbers)
-            place, turned = collider.motion.pose(0.0)
-            self.place[i] = (place - origin).tolist()
-            self.turned[i] = turned.tolist()
-            self.reach[i] = reach_of(collider, h).tolist()
-            self.velocity[i] = [0.0] * self.dimension
-            self.turning[i] = np.zeros((self.dimension, self.dimension)).tolist()
+        if rows:
+            self._write_rows(run * self.capacity, *map(list, zip(*rows, strict=True)))
         self.loads.clear(run)
+
+    def count_of(self, run: int) -> int:
+        """Return the number of colliders of a run."""
+        return self._counts[run]
 
     @ti.kernel
     def _write_numbers(self, first: int, numbers: ti.types.ndarray(ndim=1)):
@@ -387,16 +400,17 @@ class ColliderMotion:
         # Position of the pivot relative to the lower corner, m, and the angle, rad.
         self.pose = double_field(n, d + 1)
         self.axis = double_field(n, entries=(3,))
+        self._write_rows = Rows(self.pose, self.axis, self.rates).write
 
     def write(self, scene: Scene, run: int = 0) -> None:
         """Set the motions of a run, at time 0."""
-        for m, k in enumerate(self.moving):
-            motion, row = scene.colliders[k].motion, run * len(self.moving) + m
+        rows = []
+        for k in self.moving:
+            motion = scene.colliders[k].motion
             place = np.array(motion.pivot) + motion.offset - np.array(scene.domain.origin)
-            for a, value in enumerate([*place, motion.angle]):
-                self.pose[row, a] = value
-            self.axis[row] = list(motion.axis)
-            self.write_rates(run, m, [float(evaluate(tree, {"t": 0.0})) for tree in motion.rates])
+            rates = [float(evaluate(tree, {"t": 0.0})) for tree in motion.rates]
+            rows.append(([*place, motion.angle], motion.axis, rates))
+        self._write_rows(run * len(self.moving), *map(list, zip(*rows, strict=True)))
 
     def write_rates(self, run: int, m: int, rates: Sequence[float]) -> None:
         """Set the rates of the m-th moving collider in a step, d + 1 numbers."""

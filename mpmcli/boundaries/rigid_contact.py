@@ -6,9 +6,12 @@ penetrate a surface in the step ends on it, or separates from it according to th
 of an existing penetration is removed in each step.
 """
 
+import numpy as np
+
 from mpmcli.boundaries.colliders import HOLD, STICK, contact_points
 from mpmcli.boundaries.doubles import double_field
 from mpmcli.boundaries.rigid_bodies import RigidBodies
+from mpmcli.boundaries.rows import Rows
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
 from mpmcli.scene.primitives import Ball
@@ -50,29 +53,31 @@ class RigidContact:
         self.rebound = double_field(n)
         # Of each collider the index of its body, or -1, and its coefficient of restitution; of each face its friction.
         self.body_of = ti.field(int, shape=bodies.colliders.capacity)
-        self.body_of.fill(-1)
-        for j, k in enumerate(bodies.free):
-            self.body_of[k] = j
+        numbers = np.full(bodies.colliders.capacity, -1, np.int32)
+        numbers[list(bodies.free)] = np.arange(bodies.count)
+        self.body_of.from_numpy(numbers)
         self.restitution = ti.field(float, shape=runs * bodies.colliders.capacity)
         self.face_friction = ti.field(float, shape=(runs, d, 2))
+        self._write_points = Rows(self.body, self.point, self.other, self.impulse).write
+        self._write_bodies, self._write_colliders = Rows(self.ball).write, Rows(self.restitution).write
+        self._write_run = Rows(self.used, self.face_friction).write
 
     def write(self, scene: Scene, run: int = 0) -> None:
         """Set the points of a run."""
-        for k, collider in enumerate(scene.colliders):
-            self.restitution[run * self.bodies.colliders.capacity + k] = collider.restitution
-        found = [contact_points(scene.colliders[k], scene.domain.spacing) for k in self.bodies.free]
-        self.used[run] = sum(map(len, found))
-        q = run * self.capacity
-        for j, points in enumerate(found):
-            form = scene.colliders[self.bodies.free[j]].form
-            self.ball[run * self.bodies.count + j] = form.radius if isinstance(form, Ball) else 0.0
-            for point in points.tolist():
-                self.body[q], self.point[q], self.other[q] = j, point, NOTHING
-                self.impulse[q] = [0.0] * self.dimension
-                q += 1
+        colliders = [one.restitution for one in scene.colliders]
+        self._write_colliders(run * self.bodies.colliders.capacity, colliders)
+        free = [scene.colliders[k] for k in self.bodies.free]
+        radii = [one.form.radius if isinstance(one.form, Ball) else 0.0 for one in free]
+        self._write_bodies(run * self.bodies.count, radii)
+        found = [contact_points(one, scene.domain.spacing) for one in free]
+        points = np.concatenate(found)
+        own, none = np.repeat(np.arange(len(found)), [len(one) for one in found]), np.full(len(points), NOTHING)
+        self._write_points(run * self.capacity, own, points, none, np.zeros_like(points))
+        words, frictions = scene.domain.walls.faces(self.dimension), scene.domain.frictions
+        faces = np.zeros((self.dimension, 2))
         for a, side in self.walls:
-            sticks = scene.domain.walls.faces(self.dimension)[a][side] == "stick"
-            self.face_friction[run, a, side] = STUCK if sticks else scene.domain.frictions[a][side]
+            faces[a, side] = STUCK if words[a][side] == "stick" else frictions[a][side]
+        self._write_run(run, [len(points)], [faces])
 
     @ti.func
     def resolve(self, run: int, dt: ti.f64, extent: ti.template(), colliders: ti.template()):

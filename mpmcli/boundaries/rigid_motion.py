@@ -11,6 +11,7 @@ import numpy as np
 
 from mpmcli.boundaries.colliders import Colliders
 from mpmcli.boundaries.doubles import double_field, sin_cos
+from mpmcli.boundaries.rows import Rows
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
 from mpmcli.scene.rigid import Hinge
@@ -72,34 +73,46 @@ class RigidMotion:
         self.settled = ti.field(int, shape=n)
         self.system = double_field(n, self.loads, self.loads + 1)
         self.reduced = double_field(n, self.loads, 2 * self.loads)
+        columns = [
+            self.pose,
+            self.momentum,
+            self.booked,
+            self.support,
+            self.mobility,
+            self.ways,
+            self.mass,
+            self.inertia,
+        ]
+        columns += [self.weight, self.square, self.left, self.spins, self.hinged, self.start, self.hinge, self.strength]
+        self._write_rows = Rows(*columns, *([self.axes] if self.dimension == 3 else [])).write
 
     def write(self, scene: Scene, run: int = 0) -> None:
         """Set the bodies of a run, at time 0."""
         d, origin = self.dimension, np.array(scene.domain.origin)
-        for j, k in enumerate(self.free):
-            collider, b = scene.colliders[k], run * self.count + j
+        rows, zeros = [], np.zeros(self.loads)
+        for collider in (scene.colliders[k] for k in self.free):
             moments, ways, joint = collider.moments, collider.ways, collider.joint
             start = [*(np.array(moments.center) - origin), *([0.0] if d == 2 else [1.0, 0.0, 0.0, 0.0])]
             inert = np.zeros((self.loads, self.loads))
             inert[:d, :d], inert[d:, d:] = moments.mass * np.eye(d), moments.inertia
             mobility = ways @ np.linalg.inv(ways.T @ inert @ ways) @ ways.T
             found, axes = np.linalg.eigh(moments.inertia)
-            zeros = np.zeros(self.loads)
-            rows = {self.pose: start, self.momentum: inert @ collider.rates, self.booked: zeros, self.support: zeros}
-            rows |= {self.mobility: mobility, self.ways: ways}
-            rows |= {self.axes: np.vstack([axes, found])} if d == 3 else {}
-            for field, values in rows.items():
-                for place, value in np.ndenumerate(np.array(values)):
-                    field[b, *place] = value
-            self.mass[b], self.inertia[b] = moments.mass, moments.inertia.tolist()
-            first = ways[:, 0]
-            self.weight[b], self.square[b] = first @ inert @ first, first @ first
-            self.left[b], self.spins[b] = ways.shape[1], int(np.linalg.matrix_rank(ways[d:]) == self.turns)
-            self.hinged[b] = int(isinstance(joint, Hinge))
-            self.start[b] = start[:d]
-            self.hinge[b] = [(np.array(moments.center) - collider.arm - origin).tolist(), collider.arm.tolist()]
+            left, first = ways.shape[1], ways[:, 0]
+            row = [
+                start,
+                inert @ collider.rates,
+                zeros,
+                zeros,
+                mobility,
+                np.pad(ways, ((0, 0), (0, self.loads - left))),
+            ]
+            row += [moments.mass, moments.inertia, first @ inert @ first, first @ first]
+            row += [left, int(np.linalg.matrix_rank(ways[d:]) == self.turns), int(isinstance(joint, Hinge)), start[:d]]
             driven = joint is not None and joint.motor is not None
-            self.strength[b] = (joint.strength or math.inf) if driven else 0.0
+            hinge = [np.array(moments.center) - collider.arm - origin, collider.arm]
+            row += [hinge, (joint.strength or math.inf) if driven else 0.0]
+            rows.append(row + ([np.vstack([axes, found])] if d == 3 else []))
+        self._write_rows(run * self.count, *map(list, zip(*rows, strict=True)))
 
     # A step.
 

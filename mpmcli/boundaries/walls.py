@@ -8,6 +8,7 @@ import math
 from collections.abc import Sequence
 from copy import copy
 
+from mpmcli.boundaries.rows import Rows
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
 from mpmcli.scene.domain import PERIODIC
@@ -42,11 +43,13 @@ class MovingFaces:
         self.first = 0
         if faces:
             self.velocity = ti.Vector.field(dimension, float, shape=runs * len(self.faces))
+            self._rows = Rows(self.velocity)
 
     def write(self, scene: Scene, run: int = 0) -> None:
         """Set the velocities of a run."""
-        for f, (axis, side) in enumerate(self.faces):
-            self.velocity[run * len(self.faces) + f] = scene.domain.wall_velocities[axis][side]
+        if self.faces:
+            found = scene.domain.wall_velocities
+            self._rows.write(run * len(self.faces), [found[axis][side] for axis, side in self.faces])
 
     @ti.func
     def of(self, face: ti.template()):
@@ -78,11 +81,13 @@ class RoughFaces:
         self.first = 0
         if faces:
             self.coefficient = ti.field(float, shape=runs * len(self.faces))
+            self._rows = Rows(self.coefficient)
 
     def write(self, scene: Scene, run: int = 0) -> None:
         """Set the coefficients of a run."""
-        for f, (axis, side) in enumerate(self.faces):
-            self.coefficient[run * len(self.faces) + f] = scene.domain.frictions[axis][side]
+        if self.faces:
+            found = scene.domain.frictions
+            self._rows.write(run * len(self.faces), [found[axis][side] for axis, side in self.faces])
 
     @ti.func
     def of(self, face: ti.template()):

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from mpmcli.boundaries.loads import Loads
+from mpmcli.boundaries.rows import Rows
 from mpmcli.materials.elementary import exp, log
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
@@ -87,6 +88,8 @@ class BodyContact:
         self.dimension, self.layers, self.node_count = grid.dimension, layers.count, grid.node_count
         self.capacity = points_near(grid.scheme.spline.nodes, layers, grid.dimension)
         self.rows = ti.field(float, shape=(runs * layers.count, FRICTION + layers.count))
+        self._write_rows = Rows(self.rows, self.surfaces.band).write
+        self._write_count = Rows(self.surfaces.count).write
         self.pairs, self.loads = layers.pairs, Loads(max(1, layers.pairs), grid.shape, runs, on_cpu=on_cpu)
         self.extremes = ti.field(float, shape=(runs, len(EXTREMES)))
         self.share = (2 * grid.dimension + 2) * self.capacity
@@ -102,8 +105,8 @@ class BodyContact:
     def write(self, scene: Scene, run: int = 0) -> None:
         """Set the numbers of the layers of a run, and the friction between them."""
         layers, h = Layers.of(scene), scene.domain.spacing
-        self.surfaces.count[run] = layers.count
-        rows = np.zeros((layers.count, FRICTION))
+        self._write_count(run, [layers.count])
+        rows, bands = np.zeros((layers.count, FRICTION)), np.zeros(layers.count)
         for source, layer in enumerate(layers.numbers):
             if layers.has_own(source):
                 material, distance = scene.sources[source].material, lattice_spacing(scene.sources[source], h)
@@ -111,10 +114,8 @@ class BodyContact:
                 width = math.sqrt(2 * math.pi * BALL * h / beta) / distance
                 modulus = material.lame_lambda + 2 * material.shear_modulus
                 rows[layer] = [modulus, beta, width ** (1 - self.dimension), material.density]
-                self.surfaces.band[run * self.layers + layer] = distance
-        for layer, row in enumerate(np.hstack([rows, layers.frictions(scene)])):
-            for k, number in enumerate(row):
-                self.rows[run * self.layers + layer, k] = number
+                bands[layer] = distance
+        self._write_rows(run * self.layers, np.hstack([rows, layers.frictions(scene)]), bands)
 
     def read(self, run: int) -> dict[str, np.ndarray]:
         """Return the loads and the extremes of a run since the last frame, on a GPU, and reset them."""

@@ -19,6 +19,7 @@ import sys
 from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import psutil
@@ -27,7 +28,7 @@ from mpmcli.quick_taichi import ti
 from mpmcli.solver.engine.compiled_kind import CompiledKind
 from mpmcli.solver.engine.cpu_launch import CpuLaunch, FrameStats
 from mpmcli.solver.engine.cpu_phases import FrameBuffer, RunInts, RunReals
-from mpmcli.solver.machine.backend import Backend, after_stop
+from mpmcli.solver.machine.backend import CACHE_BYTES, Backend, after_stop
 
 # Versions of Taichi with which test_kernel_store.py has passed.
 KNOWN_VERSIONS = ((1, 7, 4),)
@@ -46,7 +47,7 @@ SOURCES = ("scene", "frames", "stability", "materials", "boundaries", "solver")
 PROSE = re.compile(rb'^ *""".*?"""\n|^ *#[^\n]*\n', re.MULTILINE | re.DOTALL)
 # Upper bound of the difference between the clocks of a file system and of this machine, s.
 CLOCKS = 2.0
-# Upper bound of the bytes of a file that contains a stub, and lower bound of those of a kernel.
+# Upper bound of the bytes of a file of a stub, and lower bound of those of a kernel.
 STUB_BYTES = 2**14
 # Value that the stub stores in frame_stats[0, 0, 0], which is otherwise never negative.
 MARK = -(2**30)
@@ -190,12 +191,25 @@ def _sources() -> str:
     return digest.hexdigest()
 
 
+class TaichiFile(NamedTuple):
+    """A file of Taichi: its size and that when Taichi wrote it, bytes; times of creation and of the last use, s."""
+
+    path: Path
+    size: int
+    written: int
+    created: int
+    used: int
+
+
 def link_missed() -> None:
     """Replace the files of stubs by those of the kernels launched in their place, after Taichi has written both."""
-    while _missed:
-        key, (name, folder) = _missed.popitem()
-        with contextlib.suppress(OSError):
+    folders = {folder for _, folder in _missed.values()}
+    with contextlib.suppress(OSError):
+        while _missed:
+            key, (name, folder) = _missed.popitem()
             _link(key, name, folder)
+        for folder in folders:
+            _remove_oldest(folder)
 
 
 def _link(key: str, name: str, folder: Path) -> None:
@@ -205,22 +219,35 @@ def _link(key: str, name: str, folder: Path) -> None:
     found. If a kernel of other sources was used as well, the stub stays.
     """
     files = _files_of_taichi(folder)
-    for stub, size, compiled, _ in files:
-        if size < STUB_BYTES and f"stub_{key}".encode() in stub.read_bytes():
-            recent = (path.read_bytes() for path, _, _, used in files if used >= compiled)
+    for stub in files:
+        if stub.size < STUB_BYTES and f"stub_{key}".encode() in stub.path.read_bytes():
+            recent = (file.path.read_bytes() for file in files if file.used >= stub.created)
             kernels = {content for content in recent if name.encode() in content}
             if len(kernels) == 1 and _is_sound(*kernels):
-                _write(stub, *kernels)
+                _write(stub.path, *kernels)
 
 
-def _files_of_taichi(folder: Path) -> list[tuple[Path, int, int, int]]:
-    """Return the files of Taichi: path, bytes, and the times of creation and of the last recorded use, s."""
+def _remove_oldest(folder: Path) -> None:
+    """Remove the stubs replaced first, of which Taichi knows only the former size, beyond the size of the cache."""
+    replaced = [file for file in _files_of_taichi(folder) if file.written < STUB_BYTES < file.size]
+    beyond = sum(file.size for file in replaced) - CACHE_BYTES
+    for file in sorted(replaced, key=lambda file: file.path.stat().st_mtime):
+        if beyond > 0:
+            file.path.unlink(missing_ok=True)
+            beyond -= file.size
+
+
+def _files_of_taichi(folder: Path) -> list[TaichiFile]:
+    """Return the files on Taichi's list that exist."""
     content = (folder / LIST).read_bytes()
     if (len(content) - LIST_HEAD.size) % ENTRY.size:
         return []
-    rows = ENTRY.iter_unpack(content[LIST_HEAD.size :])
-    found = [(folder / f"{name.decode()}.tic", created, used) for _, _, _, name, _, created, used in rows]
-    return [(path, path.stat().st_size, created, used) for path, created, used in found if path.exists()]
+    found = []
+    for _, _, _, name, written, created, used in ENTRY.iter_unpack(content[LIST_HEAD.size :]):
+        path = folder / f"{name.decode()}.tic"
+        if path.exists():
+            found.append(TaichiFile(path, path.stat().st_size, written, created, used))
+    return found
 
 
 def _is_sound(content: bytes) -> bool:

@@ -569,9 +569,7 @@ class Run:
 
     def _forget_lost(self) -> None:
         """Reset the records of lost particles."""
-        lost, first = self.batch.device.particles.lost, self.slot * len(self.groups)
-        for g in range(len(self.groups)):
-            lost[first + g] = NOT_LOST
+        self.batch.device.particles.forget_lost(self.slot * len(self.groups), len(self.groups))
         if self.grid.deterministic:
             self.grid.fixed.forget(self.slot)
 

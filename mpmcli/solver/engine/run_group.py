@@ -13,7 +13,6 @@ from mpmcli.solver.contact.surfaces import rest_surface
 from mpmcli.solver.engine.batch import Batch
 from mpmcli.solver.machine.plan import members_of
 from mpmcli.solver.particles.state_bounds import floor_of
-from mpmcli.solver.transfer.particle_update import NOT_LOST
 
 # Particles per copy to the device.
 PART = 2**15
@@ -141,17 +140,17 @@ class RunGroup:
         """Write particles (see `initial_states`), the table and the layers of bodies to the device."""
         for first, found, row in states:
             self.arrays.write(self.first + first, found, self.row + row)
-        for i, row in enumerate(self.rows):
-            self.arrays.table[self.row + i] = row.tolist()
-        for i, body in enumerate(self.bodies if self.arrays.layers > 1 else ()):
-            self.arrays.layer[self.row + i] = layers.numbers[body]
+        numbers = [[layers.numbers[body] for body in self.bodies]] if self.arrays.layers > 1 else []
+        self.arrays.rows.write(self.row, self.rows, *numbers)
 
 
 def groups_of(batch: Batch, slot: int, scene: Scene, particles: Sequence[BodyParticles]) -> list[RunGroup]:
     """Write the particles of a run, one entry per source, to the device; return its groups, one per law."""
     first_ids = np.concatenate([[0], np.cumsum([len(b.position) for b in particles])])
-    lost, groups, layers = batch.device.particles.lost, [], Layers.of(scene)
-    state = batch.state(slot)
+    groups, layers, state = [], Layers.of(scene), batch.state(slot)
+    if any(state.capacity):
+        # The place of an earlier run.
+        batch.device.particles.forget_lost(slot * len(batch.kind.members), len(batch.kind.members))
     for g, shared in enumerate(batch.kind.members):
         bodies = members_of(scene, shared.name)
         own = [particles[i] for i in bodies]
@@ -168,8 +167,6 @@ def groups_of(batch: Batch, slot: int, scene: Scene, particles: Sequence[BodyPar
         first, origin = [int(first_ids[i]) for i in bodies], np.array(scene.domain.origin)
         group.fill(initial_states(law, own, first, origin, surfaces), layers)
         groups.append(group)
-        if lost[slot * len(batch.kind.members) + g] != NOT_LOST:
-            lost[slot * len(batch.kind.members) + g] = NOT_LOST
     if batch.device.grid.deterministic:
         batch.device.grid.fixed.write(slot, groups, scene.domain.spacing)
     return groups

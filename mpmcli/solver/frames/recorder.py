@@ -97,7 +97,7 @@ class FrameRecorder:
         for name, takers in (("collider", device.colliders), ("contact", device.contact)):
             if takers is not None:
                 size = takers.loads.capacity * takers.loads.width
-                number = kind.layers.pairs if name == "contact" else takers.count[self._slot]
+                number = kind.layers.pairs if name == "contact" else takers.count_of(self._slot)
                 found[name] = rest[:, :size].reshape(count, -1, takers.loads.width)[:, :number]
                 rest = rest[:, size:]
         if device.rigid is not None:

@@ -8,6 +8,9 @@ hold the sums of their images after `MirrorImages` has folded them.
 from collections.abc import Sequence
 from copy import copy
 
+import numpy as np
+
+from mpmcli.boundaries.rows import Rows
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
 from mpmcli.scene.domain import PERIODIC
@@ -51,11 +54,12 @@ class Period:
         if self.axes:
             self.extent = ti.Vector.field(self.dimension, float, shape=runs)
             self.cells = ti.Vector.field(self.dimension, int, shape=runs)
+            self._rows = Rows(self.extent, self.cells)
 
     def write(self, scene: Scene, run: int = 0) -> None:
         if self.axes:
-            self.extent[run] = [n * scene.domain.spacing for n in scene.domain.cells]
-            self.cells[run] = scene.domain.cells
+            cells = np.array([scene.domain.cells])
+            self._rows.write(run, cells * scene.domain.spacing, cells)
 
     def seen_from(self, run: object) -> "Period":
         view = copy(self)

@@ -48,7 +48,7 @@ from mpmcli.solver.transfer.volume import averages_volume, needs_filling
 # Smallest numbers of entries and of colliders for which arrays have space.
 FEWEST, FEWEST_COLLIDERS = 1024, 4
 # Up to FEW_CELLS cells along an axis, their number is a multiple of FEW_TIMES in 2D and 3D; above, at least of CELLS.
-FEW_CELLS, FEW_TIMES, CELLS = 64, {2: 16, 3: 8}, 4
+FEW_CELLS, FEW_TIMES, CELLS = 64, {2: 64, 3: 8}, 4
 # Entries added to larger sizes, which are multiples of powers of two: consecutive arrays of such sizes would begin in
 # the same cache set, and steps in 2D take a fifth longer.
 SKEW = 336

@@ -5,6 +5,7 @@ from copy import copy
 
 import numpy as np
 
+from mpmcli.boundaries.rows import Rows
 from mpmcli.materials.elementary import exp
 from mpmcli.materials.law import Law
 from mpmcli.quick_taichi import ti
@@ -160,6 +161,7 @@ class ParticleArrays:
         self.table = ti.Vector.field(table[1], float, shape=table[0])
         self.kept = ti.field(float, shape=table[0])
         self.layer = ti.field(int, shape=table[0]) if layers > 1 else None
+        self.rows = Rows(self.table, *([self.layer] if layers > 1 else []))
         # Taichi stores fields one after the other, so that reads beyond the last particle fall into the next fields.
         self.spare = ti.field(float, shape=SPARE)
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mpmcli.boundaries.rows import Rows
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
 from mpmcli.scene.sheets import Sheets, sheets_of
@@ -83,19 +84,26 @@ class Emission:
         self.axes = ti.Matrix.field(d, d, float, shape=(runs, n))
         self.cells = ti.Vector.field(d, int, shape=(runs, n))
         self.marks = ti.field(int, shape=(runs * n, max(1, inflow.cells)))
+        self._rows = Rows(self.ids, self.centre, self.axes, self.velocity, self.spacing, self.low, self.cells)
 
     def write(self, scene: Scene, ids: Sequence[int], run: int = 0) -> list[Sheets]:
         """Set the mouths of a run, given the first ids of its emitters; return the sheets of each."""
         found = [sheets_of(emitter, scene) for emitter in scene.emitters]
-        for e, (sheets, emitter) in enumerate(zip(found, scene.emitters, strict=True)):
+        rows = []
+        for own, sheets, emitter in zip(ids, found, scene.emitters, strict=True):
             mouth = sheets.mouth
-            self.ids[run, e] = [ids[e], sheets.size, sheets.per_layer, sheets.particles]
-            self.centre[run, e] = (mouth.centre - np.array(scene.domain.origin)).tolist()
-            self.axes[run, e] = np.vstack([mouth.direction, mouth.across]).tolist()
-            self.velocity[run, e] = list(emitter.velocity)
-            self.spacing[run, e] = mouth.spacing.tolist()
-            self.low[run, e] = [-0.5 * mouth.spacing[0], *mouth.low.tolist()]
-            self.cells[run, e] = [1, *mouth.counts]
+            rows.append(
+                (
+                    [own, sheets.size, sheets.per_layer, sheets.particles],
+                    mouth.centre - np.array(scene.domain.origin),
+                    np.vstack([mouth.direction, mouth.across]),
+                    emitter.velocity,
+                    mouth.spacing,
+                    [-0.5 * mouth.spacing[0], *mouth.low],
+                    [1, *mouth.counts],
+                )
+            )
+        self._rows.write(run, *([list(column)] for column in zip(*rows, strict=True)))
         return found
 
     @ti.func

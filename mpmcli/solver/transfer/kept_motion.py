@@ -31,7 +31,7 @@ def keeps_motion(scene: Scene, members: Sequence[Law]) -> bool:
     driven = [collider_limit(h, collider.fastest(scene.domain, time.end)) for collider in scene.colliders]
     longest = math.inf if time.step == "auto" else time.step
     step = min(time.safety * min(own + driven), longest, time.end / time.frames)
-    return step < NEAR * OWN_STEP * max(own)
+    return bool(step < NEAR * OWN_STEP * max(own))
 
 
 def own_limit(source: Body | Emitter, law: Law, scene: Scene) -> float:

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from copy import copy
 
+from mpmcli.boundaries.rows import Rows
 from mpmcli.boundaries.walls import MovingFaces, RoughFaces
 from mpmcli.quick_taichi import ti
 from mpmcli.solver.contact.total_solids import ParticleContact
@@ -95,6 +96,11 @@ class ParticleUpdate:
         self.watches_box = watches_box
         self.lost = ti.field(int, shape=group_count)
         self.lost.fill(NOT_LOST)
+        self._rows = Rows(self.lost)
+
+    def forget_lost(self, first: int, count: int) -> None:
+        """Reset the records of lost particles of some groups."""
+        self._rows.write(first, [NOT_LOST] * count)
 
     def beside(self, nodes: LinearNodes) -> "ParticleUpdate":
         """Return an update whose stencils address these nodes."""
