@@ -10,7 +10,7 @@ from mpmcli.check.facts import SceneFacts
 from mpmcli.check.scene_limits import Start, starts_of
 from mpmcli.solver.engine.run import build_run
 
-# The kernels are those of test_check_scene.py: of a fluid without viscosity, that of the shape and the material of mpm88.
+# The kernels are those of test_check_scene.py: that of a fluid without viscosity is of the shape of mpm88.
 WATER = FLUID | {"viscosity": 1e-3}
 SUCKING = FLUID | {"tension_cutoff": False}
 WALLS = {"gravity": [0.0, 0.0], "walls": "separate"}
