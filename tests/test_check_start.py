@@ -10,14 +10,22 @@ from mpmcli.check.facts import SceneFacts
 from mpmcli.check.scene_limits import Start, starts_of
 from mpmcli.solver.engine.run import build_run
 
-FREE = {"domain": {"gravity": [0.0, 0.0]}, "shape": box([0.3, 0.3], [0.5, 0.5])}
+# The kernels are those of test_check_scene.py: that of a fluid without viscosity is of the shape of mpm88.
+WATER = FLUID | {"viscosity": 1e-3}
 SUCKING = FLUID | {"tension_cutoff": False}
+WALLS = {"gravity": [0.0, 0.0], "walls": "separate"}
+FREE = {"domain": WALLS, "shape": box([0.3, 0.3], [0.5, 0.5])}
+MPM88 = box([0.2, 0.2], [0.6, 0.6])
 CASES = {
     "a stretched solid": {"material": SOLID, "deformation": [[4.0, 0.0], [0.0, 0.25]]},
     "a solid pressed unevenly": {"material": SOLID, "deformation": [["0.9 - 0.2 * X", 0.0], [0.1, 0.8]]},
-    "compressed gas": {"material": FLUID, "deformation": 0.2},
-    "a fluid let go under tension": {"material": SUCKING, "deformation": "1.1 + 0.1 * sin(40 * X)"},
-    "a column at rest": {"material": FLUID, "initial_pressure": "hydrostatic", "domain": {"gravity": [0.0, -10.0]}},
+    "compressed gas": {"material": WATER, "deformation": 0.2},
+    "a fluid let go under tension": {"material": SUCKING, "shape": MPM88, "deformation": "1.1 + 0.1 * sin(40 * X)"},
+    "a column at rest": {
+        "material": WATER,
+        "initial_pressure": "hydrostatic",
+        "domain": WALLS | {"gravity": [0.0, -10.0]},
+    },
 }
 
 
@@ -26,7 +34,7 @@ def test_the_first_step_is_the_run_s(name: str, backend_of: Callable) -> None:
     """The check's step at the start is that of the solver, which measures every particle."""
     asked = FREE | CASES[name]
     checked = check(**asked)
-    backend = backend_of("f64")
+    backend = backend_of("f64", 1)
     run = build_run(loaded(**asked, solver={"precision": "f64"}).scene, backend)
     assert checked.facts.step_at_start == pytest.approx(run.stable_step()[0], rel=1e-9)
     assert checked.facts.step <= checked.facts.step_at_start
