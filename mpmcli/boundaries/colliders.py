@@ -172,10 +172,9 @@ class Colliders:
         self.velocity = ti.Vector.field(d, float, shape=n)
         self.turning = ti.Matrix.field(d, d, float, shape=n)
         self.count, self._counts = ti.field(int, shape=runs), [0] * runs
-        self._write_count = Rows(self.count).write
-        columns = [self.form, self.wall, self.begin, self.side, self.friction, self.lets, self.place, self.turned]
-        columns += [self.reach, self.velocity, self.turning] + ([self.sample] if self.grids else [])
-        self._write_rows = Rows(*columns).write
+        fields = [self.form, self.wall, self.begin, self.side, self.friction, self.lets, self.place, self.turned]
+        fields += [self.reach, self.velocity, self.turning] + ([self.sample] if self.grids else [])
+        self._rows, self._count = Rows(*fields), Rows(self.count)
         self.deterministic = deterministic
         self.given = ti.Vector.field(d, float, shape=n * math.prod(shape)) if deterministic else None
 
@@ -183,7 +182,7 @@ class Colliders:
         """Set the colliders of a run, at time 0."""
         h, origin = scene.domain.spacing, np.array(scene.domain.origin)
         self._counts[run] = len(scene.colliders)
-        self._write_count(run, [len(scene.colliders)])
+        self._count.write(run, [len(scene.colliders)])
         used, sampled = run * self.kind.numbers, run * self.kind.samples
         rows, still = [], np.zeros((self.dimension, self.dimension))
         for collider in scene.colliders:
@@ -192,24 +191,15 @@ class Colliders:
             place, turned = collider.motion.pose(0.0)
             held = [int(collider.axes is not None and axis not in collider.axes) for axis in AXES[: self.dimension]]
             side = -1 if collider.side == "inside" else 1
-            row = [
-                form_code(collider),
-                WALLS[collider.wall],
-                used,
-                side,
-                collider.friction,
-                held,
-                place - origin,
-                turned,
-            ]
-            rows.append([*row, reach_of(collider, h), still[0], still] + ([sampled] if self.grids else []))
+            row = [form_code(collider), WALLS[collider.wall], used, side, collider.friction, held]
+            row += [place - origin, turned, reach_of(collider, h), still[0], still]
+            rows.append(row + [sampled] * self.grids)
             used += len(numbers)
             if form_code(collider) == GRID:
                 values = samples_of(collider.form, h)[0].ravel()
                 self._write_samples(sampled, values)
                 sampled += values.size
-        if rows:
-            self._write_rows(run * self.capacity, *map(list, zip(*rows, strict=True)))
+        self._rows.write_all(run * self.capacity, rows)
         self.loads.clear(run)
 
     def count_of(self, run: int) -> int:
@@ -400,7 +390,7 @@ class ColliderMotion:
         # Position of the pivot relative to the lower corner, m, and the angle, rad.
         self.pose = double_field(n, d + 1)
         self.axis = double_field(n, entries=(3,))
-        self._write_rows = Rows(self.pose, self.axis, self.rates).write
+        self._rows = Rows(self.pose, self.axis, self.rates)
 
     def write(self, scene: Scene, run: int = 0) -> None:
         """Set the motions of a run, at time 0."""
@@ -410,12 +400,7 @@ class ColliderMotion:
             place = np.array(motion.pivot) + motion.offset - np.array(scene.domain.origin)
             rates = [float(evaluate(tree, {"t": 0.0})) for tree in motion.rates]
             rows.append(([*place, motion.angle], motion.axis, rates))
-        self._write_rows(run * len(self.moving), *map(list, zip(*rows, strict=True)))
-
-    def write_rates(self, run: int, m: int, rates: Sequence[float]) -> None:
-        """Set the rates of the m-th moving collider in a step, d + 1 numbers."""
-        for a, value in enumerate(rates):
-            self.rates[run * len(self.moving) + m, a] = value
+        self._rows.write_all(run * len(self.moving), rows)
 
     @ti.func
     def advance(self, run: int, dt: ti.f64):

@@ -58,26 +58,25 @@ class RigidContact:
         self.body_of.from_numpy(numbers)
         self.restitution = ti.field(float, shape=runs * bodies.colliders.capacity)
         self.face_friction = ti.field(float, shape=(runs, d, 2))
-        self._write_points = Rows(self.body, self.point, self.other, self.impulse).write
-        self._write_bodies, self._write_colliders = Rows(self.ball).write, Rows(self.restitution).write
-        self._write_run = Rows(self.used, self.face_friction).write
+        self._points = Rows(self.body, self.point, self.other, self.impulse)
+        self._balls, self._restitutions = Rows(self.ball), Rows(self.restitution)
+        self._runs = Rows(self.used, self.face_friction)
 
     def write(self, scene: Scene, run: int = 0) -> None:
         """Set the points of a run."""
-        colliders = [one.restitution for one in scene.colliders]
-        self._write_colliders(run * self.bodies.colliders.capacity, colliders)
         free = [scene.colliders[k] for k in self.bodies.free]
+        self._restitutions.write(run * self.bodies.colliders.capacity, [one.restitution for one in scene.colliders])
         radii = [one.form.radius if isinstance(one.form, Ball) else 0.0 for one in free]
-        self._write_bodies(run * self.bodies.count, radii)
+        self._balls.write(run * self.bodies.count, radii)
         found = [contact_points(one, scene.domain.spacing) for one in free]
         points = np.concatenate(found)
         own, none = np.repeat(np.arange(len(found)), [len(one) for one in found]), np.full(len(points), NOTHING)
-        self._write_points(run * self.capacity, own, points, none, np.zeros_like(points))
+        self._points.write(run * self.capacity, own, points, none, np.zeros_like(points))
         words, frictions = scene.domain.walls.faces(self.dimension), scene.domain.frictions
         faces = np.zeros((self.dimension, 2))
         for a, side in self.walls:
             faces[a, side] = STUCK if words[a][side] == "stick" else frictions[a][side]
-        self._write_run(run, [len(points)], [faces])
+        self._runs.write(run, [len(points)], [faces])
 
     @ti.func
     def resolve(self, run: int, dt: ti.f64, extent: ti.template(), colliders: ti.template()):

@@ -73,18 +73,10 @@ class RigidMotion:
         self.settled = ti.field(int, shape=n)
         self.system = double_field(n, self.loads, self.loads + 1)
         self.reduced = double_field(n, self.loads, 2 * self.loads)
-        columns = [
-            self.pose,
-            self.momentum,
-            self.booked,
-            self.support,
-            self.mobility,
-            self.ways,
-            self.mass,
-            self.inertia,
-        ]
-        columns += [self.weight, self.square, self.left, self.spins, self.hinged, self.start, self.hinge, self.strength]
-        self._write_rows = Rows(*columns, *([self.axes] if self.dimension == 3 else [])).write
+        fields = [self.pose, self.momentum, self.booked, self.support, self.mobility, self.ways, self.mass]
+        fields += [self.inertia, self.weight, self.square, self.left, self.spins, self.hinged, self.start]
+        fields += [self.hinge, self.strength] + ([self.axes] if self.dimension == 3 else [])
+        self._rows = Rows(*fields)
 
     def write(self, scene: Scene, run: int = 0) -> None:
         """Set the bodies of a run, at time 0."""
@@ -98,21 +90,15 @@ class RigidMotion:
             mobility = ways @ np.linalg.inv(ways.T @ inert @ ways) @ ways.T
             found, axes = np.linalg.eigh(moments.inertia)
             left, first = ways.shape[1], ways[:, 0]
-            row = [
-                start,
-                inert @ collider.rates,
-                zeros,
-                zeros,
-                mobility,
-                np.pad(ways, ((0, 0), (0, self.loads - left))),
-            ]
-            row += [moments.mass, moments.inertia, first @ inert @ first, first @ first]
-            row += [left, int(np.linalg.matrix_rank(ways[d:]) == self.turns), int(isinstance(joint, Hinge)), start[:d]]
+            spins, wide = int(np.linalg.matrix_rank(ways[d:]) == self.turns), np.zeros((self.loads, self.loads))
+            wide[:, :left] = ways
+            row = [start, inert @ collider.rates, zeros, zeros, mobility, wide, moments.mass, moments.inertia]
+            row += [first @ inert @ first, first @ first, left, spins, int(isinstance(joint, Hinge)), start[:d]]
             driven = joint is not None and joint.motor is not None
             hinge = [np.array(moments.center) - collider.arm - origin, collider.arm]
             row += [hinge, (joint.strength or math.inf) if driven else 0.0]
             rows.append(row + ([np.vstack([axes, found])] if d == 3 else []))
-        self._write_rows(run * self.count, *map(list, zip(*rows, strict=True)))
+        self._rows.write_all(run * self.count, rows)
 
     # A step.
 

@@ -4,6 +4,7 @@ Taichi compiles a kernel for each entry of a field that Python sets by its index
 """
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -39,6 +40,11 @@ class Rows:
             own = [one for one, field in zip(found, self._fields, strict=True) if _is_whole(field) == whole]
             tables.append(np.hstack([*(one.reshape(len(table), -1).astype(dtype) for one in own), table]))
         self._write(first, *tables)
+
+    def write_all(self, first: int, rows: Sequence[Sequence[ArrayLike]]) -> None:
+        """Set the rows from `first` on, each given by a value for each field."""
+        if rows:
+            self.write(first, *map(list, zip(*rows, strict=True)))
 
     @ti.kernel
     def _write(self, first: int, integers: ti.types.ndarray(ti.i32, 2), reals: ti.types.ndarray(ndim=2)):

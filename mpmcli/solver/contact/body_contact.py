@@ -88,8 +88,7 @@ class BodyContact:
         self.dimension, self.layers, self.node_count = grid.dimension, layers.count, grid.node_count
         self.capacity = points_near(grid.scheme.spline.nodes, layers, grid.dimension)
         self.rows = ti.field(float, shape=(runs * layers.count, FRICTION + layers.count))
-        self._write_rows = Rows(self.rows, self.surfaces.band).write
-        self._write_count = Rows(self.surfaces.count).write
+        self._rows, self._count = Rows(self.rows, self.surfaces.band), Rows(self.surfaces.count)
         self.pairs, self.loads = layers.pairs, Loads(max(1, layers.pairs), grid.shape, runs, on_cpu=on_cpu)
         self.extremes = ti.field(float, shape=(runs, len(EXTREMES)))
         self.share = (2 * grid.dimension + 2) * self.capacity
@@ -105,7 +104,7 @@ class BodyContact:
     def write(self, scene: Scene, run: int = 0) -> None:
         """Set the numbers of the layers of a run, and the friction between them."""
         layers, h = Layers.of(scene), scene.domain.spacing
-        self._write_count(run, [layers.count])
+        self._count.write(run, [layers.count])
         rows, bands = np.zeros((layers.count, FRICTION)), np.zeros(layers.count)
         for source, layer in enumerate(layers.numbers):
             if layers.has_own(source):
@@ -115,7 +114,7 @@ class BodyContact:
                 modulus = material.lame_lambda + 2 * material.shear_modulus
                 rows[layer] = [modulus, beta, width ** (1 - self.dimension), material.density]
                 bands[layer] = distance
-        self._write_rows(run * self.layers, np.hstack([rows, layers.frictions(scene)]), bands)
+        self._rows.write(run * self.layers, np.hstack([rows, layers.frictions(scene)]), bands)
 
     def read(self, run: int) -> dict[str, np.ndarray]:
         """Return the loads and the extremes of a run since the last frame, on a GPU, and reset them."""

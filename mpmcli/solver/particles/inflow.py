@@ -89,21 +89,17 @@ class Emission:
     def write(self, scene: Scene, ids: Sequence[int], run: int = 0) -> list[Sheets]:
         """Set the mouths of a run, given the first ids of its emitters; return the sheets of each."""
         found = [sheets_of(emitter, scene) for emitter in scene.emitters]
-        rows = []
-        for own, sheets, emitter in zip(ids, found, scene.emitters, strict=True):
-            mouth = sheets.mouth
-            rows.append(
-                (
-                    [own, sheets.size, sheets.per_layer, sheets.particles],
-                    mouth.centre - np.array(scene.domain.origin),
-                    np.vstack([mouth.direction, mouth.across]),
-                    emitter.velocity,
-                    mouth.spacing,
-                    [-0.5 * mouth.spacing[0], *mouth.low],
-                    [1, *mouth.counts],
-                )
-            )
-        self._rows.write(run, *([list(column)] for column in zip(*rows, strict=True)))
+        mouths = [sheets.mouth for sheets in found]
+        self._rows.write(
+            run,
+            [[[own, one.size, one.per_layer, one.particles] for own, one in zip(ids, found, strict=True)]],
+            [[mouth.centre - np.array(scene.domain.origin) for mouth in mouths]],
+            [[np.vstack([mouth.direction, mouth.across]) for mouth in mouths]],
+            [[emitter.velocity for emitter in scene.emitters]],
+            [[mouth.spacing for mouth in mouths]],
+            [[[-0.5 * mouth.spacing[0], *mouth.low] for mouth in mouths]],
+            [[[1, *mouth.counts] for mouth in mouths]],
+        )
         return found
 
     @ti.func
