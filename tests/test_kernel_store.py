@@ -74,7 +74,7 @@ def kernels_in(folder: Path) -> list[Path]:
 
 
 def test_a_kernel_is_stored_and_found(folder: Path) -> None:
-    """The same bytes from a kernel compiled and stored, for other particles, on one thread and two."""
+    """The same bytes from a kernel compiled and stored, and for other particles."""
     scene = drop()
     fresh = outcome(scene, compile_cache=False)
     assert not fresh.stored and not kernels_in(folder)
@@ -84,8 +84,13 @@ def test_a_kernel_is_stored_and_found(folder: Path) -> None:
     # Another start, and another number of particles.
     body = scene.bodies[0].model_copy(update={"velocity": (0.1, 0.0)})
     assert outcome(scene.model_copy(update={"bodies": (body,)})).stored
-    assert outcome(scene, 2) == fresh
-    assert outcome(scene, 2) == replace(fresh, stored=True)
+
+
+@pytest.mark.slow
+def test_a_kernel_of_two_threads_is_stored_and_found(folder: Path) -> None:
+    fresh = outcome(drop())
+    assert outcome(drop(), 2) == fresh
+    assert outcome(drop(), 2) == replace(fresh, stored=True)
 
 
 @pytest.mark.slow
@@ -354,6 +359,7 @@ def process(folder: Path) -> subprocess.Popen:
     return subprocess.Popen([sys.executable, "-c", PROCESS], stdout=subprocess.PIPE, text=True, env=environment)
 
 
+@pytest.mark.slow
 def test_processes_at_once_store_the_same_kernel(folder: Path) -> None:
     fresh = outcome(drop(), compile_cache=False)
     found = [one.communicate(timeout=300)[0].split()[-1] for one in [process(folder), process(folder)]]

@@ -100,7 +100,7 @@ def among(found: Counter, places: set[str]) -> set[str]:
 
 
 def test_a_plain_scene_has_nothing_of_features(backend_of: Callable, given: Counter, own_kernels: None) -> None:
-    """No field, function or kernel of theirs; and no more kernels than one, and one that fills the device."""
+    """No field, function or kernel of theirs; and no more kernels than one, and two that fill the device."""
     plain, backend = scene(with_features=False), backend_of("f32", 1)
     plan = make_plan(plain, backend)
     assert plan.passes == ("clear grid", "scatter fluid", "find contact", "update grid", "gather fluid")
@@ -112,7 +112,7 @@ def test_a_plain_scene_has_nothing_of_features(backend_of: Callable, given: Coun
     assert not among(given, set().union(*MODULES.values()))
     kernels = {module: count for (what, module), count in given.items() if what == "kernel" and "." in module}
     kernels.pop("taichi._kernels", None)
-    assert kernels == {"solver.engine.cpu_launch": 1, "solver.particles.arrays": 1}
+    assert kernels == {"solver.engine.cpu_launch": 1, "solver.particles.arrays": 1, "boundaries.rows": 1}
     kind, device = run.batch.kind, run.batch.device
     assert (kind.rough, kind.moving, kind.colliders.count, kind.inflow.any) == ((), (), 0, False)
     assert (device.colliders, device.motion, run.batch.pushes) == (None, None, [None])
