@@ -32,7 +32,8 @@ def test_a_run_on_a_gpu_follows_the_cpu(backend_of: Callable) -> None:
     assert np.abs(torque - expected_torque).max() < 1e-3 * np.abs(expected_torque).max()
 
 
-@pytest.mark.parametrize("dimension", [2, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("dimension", [2, 3])
 def test_rigid_bodies_on_a_gpu_follow_those_on_the_cpu(backend_of: Callable, dimension: int) -> None:
     """A raft that falls into water while it turns, and a wheel with a motor; in 3D jelly hits a box above a floor.
 
