@@ -44,13 +44,6 @@ def _count_kernels() -> None:
     kernel_impl.Kernel.materialize = counted
 
 
-def _trees() -> int:
-    """Return how many trees of fields Taichi has, of all batches since its backend started."""
-    runtime = sys.modules["taichi.lang.impl"].get_runtime()
-    runtime.materialize()
-    return runtime.prog.get_snode_tree_size()
-
-
 def _note_kinds() -> None:
     """Note the kind of each batch that is launched in this process from now on, once there are batches."""
     module = sys.modules.get("mpmcli.solver.engine.batch")
@@ -59,11 +52,9 @@ def _note_kinds() -> None:
     launch = module.Batch.launch
 
     def noted(batch: object) -> None:
-        if not hasattr(batch, "noted"):
-            # Another batch before it on the backend moves its fields, which are then those of another kernel.
-            backend, trees = batch.backend, _trees()
-            kind = repr((batch.kind, backend.arch, backend.threads, backend.precision, batch.runs, trees))
-            batch.noted = _run.add(hashlib.sha256(kind.encode()).hexdigest()[:16])
+        backend = batch.backend
+        kind = repr((batch.kind, backend.arch, backend.threads, backend.precision, batch.runs))
+        _run.add(hashlib.sha256(kind.encode()).hexdigest()[:16])
         launch(batch)
 
     noted.unnoted = launch
