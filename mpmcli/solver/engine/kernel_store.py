@@ -135,8 +135,7 @@ def stub_kernel(key: str) -> Callable[..., None]:
 def kernel_key(kind: CompiledKind, backend: Backend, runs: int, sources: str = "") -> str:
     """Return a key of the inputs of the kernel of a batch, including the memory layout of its fields.
 
-    The sources of the package are among them if their digest is given; otherwise they decide by what Taichi makes of
-    them, and the key names a kernel for which there may be several files.
+    Without the digest of the sources of the package, kernels of other sources have the same key.
     """
     ti.lang.impl.get_runtime().materialize()
     config = ti.lang.impl.current_cfg()
@@ -203,12 +202,10 @@ class TaichiFile(NamedTuple):
 
 def link_missed() -> None:
     """Replace the files of stubs by those of the kernels launched in their place, after Taichi has written both."""
-    folders = {folder for _, folder in _missed.values()}
-    with contextlib.suppress(OSError):
-        while _missed:
-            key, (name, folder) = _missed.popitem()
+    while _missed:
+        key, (name, folder) = _missed.popitem()
+        with contextlib.suppress(OSError):
             _link(key, name, folder)
-        for folder in folders:
             _remove_oldest(folder)
 
 
