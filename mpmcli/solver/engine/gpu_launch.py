@@ -8,6 +8,7 @@ Scatters use atomic additions: in floating point, in arbitrary order, so that re
 run, or in fixed point (`fixed_point`), which is reproducible.
 """
 
+import time
 from collections.abc import Callable
 
 import numpy as np
@@ -25,8 +26,16 @@ from mpmcli.solver.engine.step_size import StepSize
 from mpmcli.solver.frames.columns import FrameColumns
 from mpmcli.solver.frames.reader import chosen_columns, show_range
 from mpmcli.solver.grid.grid import box_of
+from mpmcli.solver.machine.maxima import Maxima
 from mpmcli.solver.particles.sort import SPAN, keep, take
-from mpmcli.solver.particles.state_bounds import NOTHING, deformation_rate, entries, widen_motion, widen_state
+from mpmcli.solver.particles.state_bounds import (
+    GPU_WORKERS,
+    NOTHING,
+    deformation_rate,
+    entries,
+    widen_motion,
+    widen_state,
+)
 from mpmcli.solver.transfer.cpu_transfers import update_rows
 from mpmcli.solver.transfer.lanes import LANES
 from mpmcli.solver.transfer.particle_update import NOT_LOST, ParticleUpdate
@@ -56,12 +65,30 @@ class GpuPhases(RunPhases):
 
     Attributes:
         numbers, counts: the arrays of `Batch` on the device; `numbers` is None without double precision.
+        peaks: per run, extremes of the step while threads raise them: of the squared speed of nodes, and per group of
+            the rate of deformation and of the change by relaxation.
     """
 
     def __init__(self, device: Device, layout: Layout, *, doubles: bool) -> None:
         super().__init__(device, layout)
         self.counts = ti.field(ti.i32, shape=(device.runs, layout.widths["counts"]))
         self.numbers = double_field(device.runs, layout.widths["numbers"]) if doubles else None
+        self.peaks = Maxima(device.runs, 1 + 2 * len(device.groups))
+
+    @ti.func
+    def forget_peaks(self, w: int):
+        """Reset the extremes of a step of a run."""
+        for k in ti.static(range(1 + 2 * len(self.members))):
+            self.peaks.reset(w, k, NOTHING)
+
+    @ti.func
+    def store_peaks(self, w: int):
+        """Store the extremes of a step of a run as numbers of the step."""
+        (step,) = ti.static((self.step_of(w),))
+        step.speed_squared = ti.max(step.speed_squared, self.peaks.value(w, 0))
+        for g in ti.static(range(len(self.members))):
+            step.rate[g] = ti.max(step.rate[g], self.peaks.value(w, 1 + 2 * g))
+            step.volume_change[g] = ti.max(step.volume_change[g], self.peaks.value(w, 2 + 2 * g))
 
     def run(self, w: object) -> RunState:
         """Return the numbers of a run."""
@@ -163,8 +190,7 @@ class GpuPhases(RunPhases):
         """Relax the volume of a particle in steps that relax volumes."""
         if at.step.relaxed > 0.0:
             change = at.particles.relax(self.device.groups[at.g], at.q, at.step.relaxed)
-            if change > at.step.volume_change[at.g]:
-                ti.atomic_max(at.step.volume_change[at.g], change)
+            self.peaks.include(at.w, 2 + 2 * at.g, change)
 
     @ti.func
     def find_contact(self, at: ti.template()):
@@ -192,9 +218,7 @@ class GpuPhases(RunPhases):
     def update_node(self, at: ti.template(), node: ti.template()):
         """Convert the momentum of a node of a layer to velocity."""
         squared = at.nodes.update(node, at.grid.linear_index(node), self.gravity_of(at.step))
-        # The comparison may use an old value; it avoids most atomic operations.
-        if squared > at.step.speed_squared:
-            ti.atomic_max(at.step.speed_squared, squared)
+        self.peaks.include(at.w, 0, squared)
 
     @ti.func
     def meet(self, at: ti.template()):
@@ -221,8 +245,7 @@ class GpuPhases(RunPhases):
         layer = at.group.layer_of(at.q)
         (particles,) = ti.static((self.beside(at, layer),))
         rate = particles.advance(at.g, self.device.groups[at.g], at.q, at.step.dt, self.gravity_of(at.step))
-        if rate > at.step.rate[at.g]:
-            ti.atomic_max(at.step.rate[at.g], rate)
+        self.peaks.include(at.w, 1 + 2 * at.g, rate)
 
     # Bodies with their own velocity fields, see `contact.body_contact`.
 
@@ -344,6 +367,7 @@ class GpuLaunch:
         doubles: whether the device has double precision.
         shifts: whether some steps shift particles.
         reach: largest number of items per run of each kind, see OVER.
+        compile_seconds: wall time of the first call of each kernel of a step, which compiles it, s.
     """
 
     def __init__(self, device: Device, layout: Layout, *, doubles: bool) -> None:
@@ -357,15 +381,18 @@ class GpuLaunch:
         self.averages = any(group.uses_f_bar for group in groups)
         self.loads = device.colliders.loads.rows * device.colliders.loads.capacity if device.nodes.collides else 0
         self.threads = device.contact.threads if device.contact is not None else 0
-        runs, widest = self.runs, max(entries(group) for group in groups)
+        runs, self.widest = self.runs, max(entries(group) for group in groups)
+        self.workers = max(1, GPU_WORKERS // runs)
         self.counts, self.numbers = self.phases.counts, self.phases.numbers
         self.stepping, self.begun, self.sorting = (ti.field(int, shape=runs) for _ in range(3))
         self.active = ti.field(int, shape=(runs, len(groups)))
         self.reach = ti.field(int, shape=len(OVER))
-        self.maxima = ti.field(float, shape=(runs, len(groups), widest))
+        self.maxima = Maxima(runs, len(groups) * self.widest)
         self.stencils = ti.field(int, shape=(2 * runs, self.dimension))
         self.emission = GpuEmission(device, layout, self.counts) if device.emission is not None else None
         self.readers = [self._reader(g) for g in range(len(groups))]
+        self.compile_seconds = 0.0
+        self._called: set[tuple] = set()
 
     # A launch.
 
@@ -425,13 +452,21 @@ class GpuLaunch:
     def _take_step(self, *, shifts: bool) -> None:
         """Take a step of every advancing run, launch by launch; few steps shift particles first."""
         if shifts:
-            self.step(SHIFT)
-        self.step(FIRST)
+            self._call(self.step, SHIFT)
+        self._call(self.step, FIRST)
         if self.phases.rigid:
             for _ in range(ROUNDS):
-                self.step(ROUND)
+                self._call(self.step, ROUND)
             for part in range(ROUND + 1, len(self.parts)):
-                self.step(part)
+                self._call(self.step, part)
+
+    def _call(self, kernel: Callable, *arguments: int) -> None:
+        """Call a kernel, and measure its first call with these arguments."""
+        began = time.perf_counter()
+        kernel(*arguments)
+        if (kernel.__name__, *arguments) not in self._called:
+            self._called.add((kernel.__name__, *arguments))
+            self.compile_seconds += time.perf_counter() - began
 
     def _parts(self) -> list[list[tuple[Phase, int]]]:
         """Return the phases of each launch of a step, with their turns."""
@@ -470,7 +505,7 @@ class GpuLaunch:
                     w = p // self.capacity[phase.group]
                     if self.stepping[w] == 1 and self.takes_part(phase.group, w, p):
                         self.phases.do(phase, turn, w, p)
-        if ti.static(self.doubles and part == len(self.parts) - 1):
+        if ti.static(part == len(self.parts) - 1):
             for w in range(self.runs):
                 if self.stepping[w] == 1:
                     self.end(w)
@@ -504,12 +539,15 @@ class GpuLaunch:
             if ti.static(self.device.grid.deterministic):
                 self.device.grid.fixed.set_step(w, ti.max(step.kick, step.stable))
             self.phases.forget_extremes(step)
+            self.phases.forget_peaks(w)
 
     @ti.func
     def end(self, w: int):
-        """Finish the step of a run."""
-        (run,) = ti.static((self.phases.run(w),))
-        self.steps.end(run, self.phases.end_step(run))
+        """Finish the step of a run, whose time the host updates without double precision."""
+        self.phases.store_peaks(w)
+        if ti.static(self.doubles):
+            (run,) = ti.static((self.phases.run(w),))
+            self.steps.end(run, self.phases.end_step(run))
 
     # Measurements of the state.
 
@@ -524,24 +562,28 @@ class GpuLaunch:
         runs.status[waiting] = ATTEND
         for g, group in self.members:
             for k in range(entries(group)):
-                runs.maxima[g][k][waiting] = maxima[waiting, g, k]
+                runs.maxima[g][k][waiting] = maxima[waiting, g * self.widest + k]
 
     @ti.kernel
     def find_maxima(self):
         """Find the maxima of each group of the runs that are marked in `sorting`."""
-        for w, g, k in self.maxima:
-            self.maxima[w, g, k] = NOTHING
+        for w in range(self.runs):
+            for k in ti.static(range(len(self.members) * self.widest)):
+                self.maxima.reset(w, k, NOTHING)
         for g, group in ti.static(self.members):
-            for p in range(self.runs * self.capacity[g]):
-                w = p // self.capacity[g]
-                if self.sorting[w] == 1 and self.takes_part(g, w, p):
+            for q in range(self.runs * self.workers):
+                w, p = q // self.workers, q % self.workers
+                (run,) = ti.static((self.phases.run(w),))
+                if self.sorting[w] == 1 and p < run.particles[g]:
                     own = ti.Vector([NOTHING] * ti.static(entries(group)))
-                    v, C = group.motion(p)
-                    widen_motion(own, v, deformation_rate(group, C))
-                    widen_state(group, own, p)
+                    while p < run.particles[g]:
+                        at = w * ti.static(self.capacity[g]) + p
+                        v, C = group.motion(at)
+                        widen_motion(own, v, deformation_rate(group, C))
+                        widen_state(group, own, at)
+                        p += self.workers
                     for k in ti.static(range(entries(group))):
-                        if own[k] > self.maxima[w, g, k] or own[k] != own[k]:
-                            ti.atomic_max(self.maxima[w, g, k], own[k])
+                        self.maxima.include(w, g * self.widest + k, own[k])
 
     # Sorts.
 
@@ -553,13 +595,13 @@ class GpuLaunch:
         self.sorting.from_numpy(due.astype(np.int32))
         if self.sorts:
             for g in range(len(self.members)):
-                self.sort(g)
+                self._call(self.sort, g)
             if self.device.comes_and_goes:
                 active = self.active.to_numpy()
                 for g in range(len(self.members)):
                     runs.particles[g][due] = active[due, g]
                 self.counts.from_numpy(counts)
-        self.find_box()
+        self._call(self.find_box)
         runs.drift[due] = 0.0
         self.counts.from_numpy(counts)
 

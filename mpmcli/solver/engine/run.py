@@ -71,7 +71,7 @@ class Run:
         batch, slot: the batch, and the slot of the run in it.
         groups: the particles, one group per law.
         particle_count: number of particles.
-        first_step_seconds: wall time of the first launch, which compiles the kernels; 0 before it.
+        first_step_seconds: wall time that compiles the kernels, see `Batch`; 0 before.
         frame_seconds, frame_processor_seconds: wall and processor time spent so far on frames and ledger rows, s.
     """
 
@@ -323,7 +323,7 @@ class Run:
         """Update the budget and wall times after a launch."""
         seconds, steps = self._launched
         self._budget.took(self.step_count - steps, self.batch.seconds - seconds)
-        self.first_step_seconds = self.first_step_seconds or self.batch.first_seconds
+        self.first_step_seconds = self.batch.first_seconds
 
     def _recorded(self) -> Iterator[tuple[Frame, LedgerRow]]:
         """Yield the frames recorded in the last launch."""

@@ -100,7 +100,7 @@ def choose_backend(
 
     Args:
         threads: number of CPU threads; None for one per core.
-        optimisation: None for "most" on the CPU and "all" on a GPU.
+        optimisation: None for "most" on the CPU and "few" on a GPU, whose driver optimises again.
 
     Raises:
         InputError: the backend or the precision is unknown, the backend lacks the precision, or the number of threads
@@ -118,7 +118,7 @@ def choose_backend(
     most = max(FEW_THREADS, 2 * cores)
     if not 1 <= count <= most:
         raise InputError(f"--threads {count} is not possible; give 1 to {most}, ideally {cores} on this machine.")
-    usual: Optimisation = "most" if wanted == "cpu" else "all"
+    usual: Optimisation = "most" if wanted == "cpu" else "few"
     return Backend(wanted, count, precision, compile_cache, optimisation or usual)
 
 

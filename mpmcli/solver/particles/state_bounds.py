@@ -9,6 +9,7 @@ from mpmcli.materials.law import Law, StateBound
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene, highest_speed
 from mpmcli.solver.machine.backend import Backend
+from mpmcli.solver.machine.maxima import Maxima
 from mpmcli.solver.particles.sort import CHUNK, share_start
 
 # Minima are stored as maxima of negated values.
@@ -156,7 +157,7 @@ def build_maxima(size: int, widen: Callable, backend: Backend) -> Callable[[int,
     if size == 0:
         return lambda first, count, run: []
     vector = ti.types.vector(size, float)
-    found = ti.field(float, shape=size)
+    found = Maxima(1, size)
     # Each worker keeps its own maxima and merges them once, because an atomic per particle takes longer than everything
     # else.
     workers = CHUNK * backend.threads if backend.on_cpu else GPU_WORKERS
@@ -165,7 +166,7 @@ def build_maxima(size: int, widen: Callable, backend: Backend) -> Callable[[int,
     @ti.kernel
     def reduce(first: int, count: int, run: int) -> vector:
         for i in ti.static(range(size)):
-            found[i] = NOTHING
+            found.reset(0, i, NOTHING)
         for q in range(workers):
             if ti.static(on_cpu):
                 if q % CHUNK == 0:
@@ -175,7 +176,7 @@ def build_maxima(size: int, widen: Callable, backend: Backend) -> Callable[[int,
                     for p in range(start, share_start(count, t + 1, backend.threads)):
                         widen(own, first + p, run)
                     for i in ti.static(range(size)):
-                        ti.atomic_max(found[i], own[i])
+                        found.include(0, i, own[i])
             else:
                 own = ti.Vector([NOTHING] * size)
                 p = q
@@ -183,10 +184,10 @@ def build_maxima(size: int, widen: Callable, backend: Backend) -> Callable[[int,
                     widen(own, first + p, run)
                     p += workers
                 for i in ti.static(range(size)):
-                    ti.atomic_max(found[i], own[i])
+                    found.include(0, i, own[i])
         result = vector(0.0)
         for i in ti.static(range(size)):
-            result[i] = found[i]
+            result[i] = found.value(0, i)
         return result
 
     return lambda first, count, run: [float(value) for value in reduce(first, count, run)]
