@@ -24,7 +24,9 @@ def test_the_largest_number_remains(backend_of: Callable, arch: str, precision: 
 
     @ti.kernel
     def widen(
-        start: float, values: ti.types.ndarray(dtype=of_particles, ndim=1), found: ti.types.ndarray(dtype=of_particles, ndim=1)
+        start: float,
+        values: ti.types.ndarray(dtype=of_particles, ndim=1),
+        found: ti.types.ndarray(dtype=of_particles, ndim=1),
     ):
         for k in range(3):
             maxima.reset(1, k, start)

@@ -11,6 +11,7 @@ from mpmcli.errors import InputError
 from mpmcli.scene.domain import Domain
 from mpmcli.scene.entry import Entry, entries_in, value_of, varies
 from mpmcli.scene.expression import INITIAL, Expression, derivative, evaluate
+from mpmcli.scene.fitting import fitted
 from mpmcli.scene.points import Points
 from mpmcli.scene.primitives import Box
 from mpmcli.scene.problem import Path, path_text
@@ -20,7 +21,7 @@ from mpmcli.scene.schema import Body, Scene
 from mpmcli.scene.sheets import sheets_of
 
 # Points per radius^d of a sample, as measured, in 2D and 3D. Sampling to saturation would give 0.6965 and 0.7334.
-DENSITY = {2: 0.680, 3: 0.652}
+DENSITY = {2: 0.680, 3: 0.647}
 # Cells per radius along an axis, number of rounds of dart throwing, and candidate points per radius^d in each round.
 _FINE, _ROUNDS, _OFFERED = {2: 6, 3: 4}, 14, 1.0
 # Radii by which the box is enlarged: points are denser at an edge, which has no competing points beyond it.
@@ -314,9 +315,14 @@ def estimate_body(body: Body, h: float) -> int:
     form = body.shape.form
     if isinstance(form, Points):
         return len(form.position)
+    counts = _lattice_counts(body, h)
     if isinstance(form, Box) and body.sampling != "poisson":
-        return math.prod(_lattice_counts(body, h))
-    return max(1, round(form.volume / lattice_spacing(body, h) ** len(body.velocity)))
+        return math.prod(counts)
+    cell = lattice_spacing(body, h) ** len(body.velocity)
+    if body.sampling in ("lattice", "jittered"):
+        lower, upper = form.bounds()
+        cell = math.prod((upper - lower).tolist()) / math.prod(counts)
+    return max(1, round(form.volume / cell))
 
 
 def count_particles(scene: Scene) -> int:
@@ -353,17 +359,9 @@ def lattice_points(body: Body, h: float) -> int:
 
 
 def _lattice_counts(body: Body, h: float) -> list[int]:
-    """Return the number of lattice points along each axis.
-
-    The lattice of a box is stretched to fit it; any other keeps its spacing, is centred on the bounding box, and covers
-    it.
-    """
+    """Return the number of lattice points along each axis of the bounding box, to which the lattice is stretched."""
     lower, upper = body.shape.form.bounds()
-    ratios = ((upper - lower) / lattice_spacing(body, h)).tolist()
-    if isinstance(body.shape.form, Box):
-        return [max(1, round(r)) for r in ratios]
-    # A bounding box of a whole number of spacings, up to round-off, needs no additional point.
-    return [max(1, math.ceil(r - 1e-9)) for r in ratios]
+    return [max(1, round(r)) for r in ((upper - lower) / lattice_spacing(body, h)).tolist()]
 
 
 def particle_places(body: Body, index: int, h: float) -> np.ndarray:
@@ -374,13 +372,17 @@ def particle_places(body: Body, index: int, h: float) -> np.ndarray:
     form = body.shape.form
     if isinstance(form, Points):
         return form.position
+    spacing, d = lattice_spacing(body, h), len(body.velocity)
     if body.sampling == "poisson":
-        radius = disk_radius(lattice_spacing(body, h), len(body.velocity))
-        points = poisson_disk(*form.bounds(), radius, _generator(body, index))
+        points = poisson_disk(*form.bounds(), disk_radius(spacing, d), _generator(body, index))
         return points[form.contains(points)]
     if body.sampling == "turned":
         return _turned(body, h)
-    return np.concatenate([points[form.contains(points)] for points in _lattice(body, index, h)])
+    points, middles = (np.concatenate(found) for found in zip(*_lattice(body, index, h), strict=True))
+    if isinstance(form, Box):
+        return points
+    lower, upper = form.bounds()
+    return fitted(form, points, middles, np.diag((upper - lower) / _lattice_counts(body, h)))
 
 
 def _turned(body: Body, h: float) -> np.ndarray:
@@ -389,8 +391,8 @@ def _turned(body: Body, h: float) -> np.ndarray:
     lower, upper = form.bounds()
     if isinstance(form, Box):
         return turned_box(lower, upper, np.array(_lattice_counts(body, h)))
-    points = (lower + upper) / 2 + spacing * turned_points((upper - lower) / (2 * spacing))
-    return points[form.contains(points)]
+    points = (lower + upper) / 2 + spacing * turned_points((upper - lower) / (2 * spacing) + 1)
+    return fitted(form, points, points, spacing * turned_axes(len(lower)).T)
 
 
 def _sample(body: Body, index: int, domain: Domain) -> BodyParticles:
@@ -425,7 +427,9 @@ def holds_particles(body: Body, index: int, h: float) -> bool:
         return estimate_body(body, h) > _SURE or len(particle_places(body, index, h)) > 0
     if body.sampling == "turned":
         return len(_turned(body, h)) > 0
-    return any(body.shape.form.contains(points).any() for points in _lattice(body, index, h))
+    return any(body.shape.form.contains(points).any() for points, _ in _lattice(body, index, h)) or bool(
+        len(particle_places(body, index, h))
+    )
 
 
 def no_particles(body: Body, h: float) -> str:
@@ -435,28 +439,24 @@ def no_particles(body: Body, h: float) -> str:
     )
 
 
-def _lattice(body: Body, index: int, h: float) -> Iterator[np.ndarray]:
-    """Yield the points (k, d) of the body's lattice in order, a bounded number at a time.
+def _lattice(body: Body, index: int, h: float) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield the points (k, d) of the body's lattice in order and the middles of their cells, some at a time.
 
-    A jittered body has one random point in each cell of the lattice instead of the centre.
+    A jittered body has one random point in each cell of the lattice instead of the middle.
     """
     lower, upper = body.shape.form.bounds()
     counts = np.array(_lattice_counts(body, h))
-    if isinstance(body.shape.form, Box):
-        spacing = (upper - lower) / counts
-        start = lower
-    else:
-        spacing = np.full(len(counts), lattice_spacing(body, h))
-        start = (lower + upper - counts * spacing) / 2
+    spacing = (upper - lower) / counts
     total = math.prod(counts.tolist())
     generator = _generator(body, index)
     for first in range(0, total, _POINTS_AT_ONCE):
         flat = np.arange(first, min(first + _POINTS_AT_ONCE, total))
         cells = np.stack(np.unravel_index(flat, counts), axis=1)
-        offset = generator.random(cells.shape) if body.sampling == "jittered" else 0.5
-        points = start + (cells + offset) * spacing
-        # Round-off may carry a point of a box past a face by one unit in the last place.
-        yield np.clip(points, lower, upper) if isinstance(body.shape.form, Box) else points
+        # Round-off may carry a point past a face by one unit in the last place.
+        middles = points = np.clip(lower + (cells + 0.5) * spacing, lower, upper)
+        if body.sampling == "jittered":
+            points = np.clip(lower + (cells + generator.random(cells.shape)) * spacing, lower, upper)
+        yield points, middles
 
 
 def turned_axes(d: int) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Maxima that many threads of a GPU raise, stored as integers in the order of floats.
 
-GPUs have an atomic maximum of integers. Taichi repeats one of floats in each thread until no other thread interferes: on
-an H100 the update of nodes took three times as long.
+GPUs have an atomic maximum of integers. Taichi repeats one of floats in each thread until no other thread interferes:
+on an H100 the update of nodes took three times as long.
 """
 
 import numpy as np
