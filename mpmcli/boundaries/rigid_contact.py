@@ -19,6 +19,8 @@ from mpmcli.scene.primitives import Ball
 # Distance in cells below which a point may touch an obstacle in a step; fraction of a penetration that a step removes;
 # largest number of sweeps; largest change of an impulse in a sweep, over the largest impulse, at which sweeps end.
 NEAR, UNDONE, SWEEPS, ENOUGH = 0.6, 0.2, 50, 1e-6
+# Smallest change of velocity by an impulse, over that of the free body, at which a point is pushed.
+LEAST = 1e-9
 # Number of iterations for the point of a ball that faces an obstacle.
 LOOKS = 2
 # Coefficient of friction of sticking surfaces; codes of a wall and of no obstacle in place of the index of a collider.
@@ -195,6 +197,8 @@ class RigidContact:
         """Update the impulse at point q to satisfy its contact conditions; return the size of the change, N s."""
         velocity = self.velocity_of(run, q, colliders)
         normal, before = self.normal[q], self.impulse[q]
+        # A point on a hinge, or of a body that cannot move along the normal, does not yield.
+        free = ti.cast(1, ti.f64) / self.bodies.mass[run * self.bodies.count + self.body[q]]
         along = velocity.dot(normal)
         wanted = -self.gap[q] / dt
         if self.gap[q] < 0:
@@ -210,10 +214,11 @@ class RigidContact:
         # In a loop, so that it is compiled once.
         for k in range(2 if speed > 0 and self.friction[q] > 0 else 1):
             yielding = self.yielding(run, q, normal if k == 0 else slide / speed)
-            if k == 0:
-                pressed = ti.max(old + (wanted - along) / yielding, 0.0)
-            else:
-                rub -= slide / yielding
+            if yielding > LEAST * free:
+                if k == 0:
+                    pressed = ti.max(old + (wanted - along) / yielding, 0.0)
+                else:
+                    rub -= slide / yielding
         after = pressed * normal + self.rubbed(q, rub, pressed)
         self.give(run, q, after - before)
         for a in ti.static(range(self.dimension)):

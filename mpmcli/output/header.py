@@ -16,6 +16,7 @@ from mpmcli.scene.domain import PERIODIC, Walls
 from mpmcli.scene.entry import definitions
 from mpmcli.scene.mesh import ClosedSurface, Mesh
 from mpmcli.scene.quantity import AXES
+from mpmcli.scene.sampling import rest_volume
 from mpmcli.scene.schema import SolverSettings, usual_particles_per_cell
 from mpmcli.scene.shapes import BodyShape
 from mpmcli.scene.sheets import sheets_of
@@ -213,8 +214,10 @@ class RunHeader:
     @classmethod
     def of(cls, scene: Scene, text: str, laws: Sequence[Any], backend: Mapping[str, Any]) -> "RunHeader":
         """Return the header of a new run; `text` is the complete scene as TOML, laws as in `Frame.material`."""
-        # The file of a shape may be gone later.
-        from_files = any(body.shape.files for body in scene.bodies)
+        # The file of a shape may be gone later, and a deformed body has another volume at rest.
+        known = not any(
+            body.shape.files or body.deformation is not None or body.initial_pressure for body in scene.bodies
+        )
         emitted = [sheets_of(emitter, scene) for emitter in scene.emitters]
         return cls.read(
             {
@@ -225,7 +228,7 @@ class RunHeader:
                 "origin": list(scene.domain.origin),
                 "size": list(scene.domain.size),
                 "bodies": [body.name for body in scene.sources],
-                **({"volumes": [body.shape.form.volume for body in scene.bodies]} if from_files else {}),
+                **({} if known else {"volumes": [rest_volume(body, scene.domain) for body in scene.bodies]}),
                 "materials": [law.name for law in laws],
                 "laws": [LawHeader.model_validate(law).model_dump(exclude={"name"}) for law in laws],
                 "precision": backend["precision"],

@@ -34,7 +34,7 @@ from mpmcli.scene.problem import (
     value_at,
 )
 from mpmcli.scene.quantity import dimension_of
-from mpmcli.scene.sampling import points_per_cell
+from mpmcli.scene.sampling import points_per_cell, rest_volume
 from mpmcli.scene.schema import Scene, scene_model
 from mpmcli.scene.toml_file import apply_overrides, copied, key_lines, line_of, read_toml
 
@@ -202,7 +202,7 @@ def _with_accelerations(scene: Scene) -> Scene:
         mass = next((one.moments.mass for one in scene.colliders if one.free and one.name == force.body), 0.0)
         for index, body in enumerate(scene.bodies):
             if force.force is not None and body.name == force.body:
-                mass = body.material.density * body.shape.form.volume
+                mass = body.material.density * rest_volume(body, scene.domain)
                 if force.region is not None:
                     mass *= float(force.region.form.contains(body_places(body, index, scene.domain.spacing)).mean())
         forces.append(force.spread(mass))

@@ -18,6 +18,7 @@ from mpmcli.scene.problem import Path, path_text
 from mpmcli.scene.quantity import place_text
 from mpmcli.scene.relaxation import relaxed
 from mpmcli.scene.schema import Body, Scene
+from mpmcli.scene.shapes import Form
 from mpmcli.scene.sheets import sheets_of
 
 # Points per radius^d of a sample, as measured, in 2D and 3D. Sampling to saturation would give 0.6965 and 0.7334.
@@ -26,6 +27,8 @@ DENSITY = {2: 0.680, 3: 0.647}
 _FINE, _ROUNDS, _OFFERED = {2: 6, 3: 4}, 14, 1.0
 # Radii by which the box is enlarged: points are denser at an edge, which has no competing points beyond it.
 _MARGIN = 3
+# Number of places in a bounding box over which a deformation is averaged.
+_AVERAGED = 4096
 _PLACES_AT_ONCE = 2_000
 
 
@@ -157,6 +160,31 @@ def initial_deformation(body: Body, position: np.ndarray, domain: Domain) -> np.
     return _at(body.deformation, position).astype(np.float64)
 
 
+def rest_volume(body: Body, domain: Domain) -> float:
+    """Return the volume of a body at rest, m^3: that of its shape, which it fills at the start, over J.
+
+    A J that varies is averaged over places in the shape. A modulus that is still "auto" counts as incompressible.
+    """
+    form = body.shape.form
+    unknown = body.initial_pressure == "hydrostatic" and getattr(body.material, "bulk_modulus", None) == "auto"
+    if unknown or (body.deformation is None and body.initial_pressure != "hydrostatic"):
+        return form.volume
+    places = form.position if isinstance(form, Points) else _places_in(form)
+    J = initial_deformation(body, places, domain)
+    J = J if J.ndim == 1 else np.linalg.det(J)
+    return form.volume * float(np.mean(1.0 / J[J > 0]))
+
+
+def _places_in(form: Form) -> np.ndarray:
+    """Return places spread evenly over a form, (n, d), m, at least one."""
+    lower, upper = form.bounds()
+    count = round(_AVERAGED ** (1 / len(lower)))
+    places = lower + (upper - lower) * (np.stack(np.indices((count,) * len(lower)), axis=-1) + 0.5) / count
+    places = places.reshape(-1, len(lower))
+    inside = places[form.contains(places)]
+    return inside if len(inside) else (lower + upper)[None] / 2
+
+
 def hydrostatic_load(body: Body, position: np.ndarray, domain: Domain) -> np.ndarray:
     """Return density times g times depth, (n,), Pa; depth is measured along gravity from the top of the bounding box.
 
@@ -261,7 +289,7 @@ class BodyParticles:
         position: (n, d) float64, m, in the coordinates of the scene.
         velocity: (n, d) float64, m/s; one read-only row where all have the same.
         affine: (n, d, d) float64, initial velocity gradient, 1/s; one read-only matrix where all have the same.
-        volume: volume of each particle, m^3 (m^2 in 2D): that of the shape divided by n.
+        volume: volume of each particle at rest, m^3 (m^2 in 2D): that of the body divided by n, see `rest_volume`.
         mass: mass of each particle, kg (kg per metre of depth in 2D).
         deformation: J, (n,), or F, (n, d, d), at the start; None where there is none.
         initial: (n, d), the X of expressions, m, if it differs from the position.
@@ -400,9 +428,8 @@ def _sample(body: Body, index: int, domain: Domain) -> BodyParticles:
     position = particle_places(body, index, domain.spacing)
     if not len(position):
         raise InputError(no_particles(body, domain.spacing))
-    volume = form.volume / len(position)
     if body.relaxed:
-        position = relaxed(position, volume, form, domain)
+        position = relaxed(position, form.volume / len(position), form, domain)
     # A body too large to be examined when the scene was loaded.
     faults = [f"{path_text(('bodies', index, *key))}: {said}" for key, said in initial_faults(body, position, domain)]
     if faults:
@@ -411,6 +438,7 @@ def _sample(body: Body, index: int, domain: Domain) -> BodyParticles:
     if isinstance(form, Points) and form.file_velocity is not None:
         velocity = velocity + form.file_velocity
     deformation = initial_deformation(body, position, domain)
+    volume = rest_volume(body, domain) / len(position)
     return BodyParticles(body.name, position, velocity, affine, volume, body.material.density * volume, deformation)
 
 

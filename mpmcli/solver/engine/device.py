@@ -302,7 +302,7 @@ class RunPhases:
     @ti.func
     def forget_extremes(self, step: ti.template()):
         """Reset the largest speed and rates of a step."""
-        step.speed_squared = 0.0
+        step.speed_squared, step.broken = 0.0, 0.0
         for g in ti.static(range(len(self.members))):
             # A law may not have particles yet.
             step.rate[g] = 0.0 if ti.static(self.device.comes_and_goes) else NOTHING
@@ -310,9 +310,11 @@ class RunPhases:
 
     @ti.func
     def end_step(self, run: ti.template()):
-        """Store the rates of a step; return the largest speed of a node, m/s, or -1 if a particle was lost."""
+        """Store the rates of a step; return the largest speed of a node, m/s, or -1 if anything was lost."""
         (step,) = ti.static((self.step_of(run.w),))
         speed = ti.sqrt(step.speed_squared)
+        if step.broken > 0.0:
+            speed = -1.0
         for g in ti.static(range(len(self.members))):
             # The relaxation contributes to the rate of deformation.
             run.rate[g] = ti.cast(step.volume_change[g], ti.f64) / run.dt + ti.cast(step.rate[g], ti.f64)
@@ -344,7 +346,10 @@ class RunPhases:
         if ti.static(turn == 1):
             self.device.rigid_contact.resolve(at.w, at.run.dt, at.particles.extent, at.nodes.colliders)
         if ti.static(turn == 2):
-            ti.atomic_max(at.step.speed_squared, at.nodes.rigid.move(at.w, at.run.dt))
+            fastest, finite = at.nodes.rigid.move(at.w, at.run.dt)
+            ti.atomic_max(at.step.speed_squared, fastest)
+            if not finite:
+                at.step.broken = 1.0
 
     @ti.func
     def gravity_of(self, step: ti.template()):

@@ -446,7 +446,7 @@ class GpuLaunch:
             run = self.phases.state(w, numbers, counts)
             for g, (rate, change) in enumerate(zip(steps.rate, steps.volume_change, strict=True)):
                 run.rate[g] = float(rate[w]) + float(change[w]) / run.dt
-            sound = (lost[w] == NOT_LOST).all()
+            sound = (lost[w] == NOT_LOST).all() and steps.broken[w] == 0
             self.steps.end(run, float(np.sqrt(steps.speed_squared[w])) if sound else -1.0)
 
     def _take_step(self, *, shifts: bool) -> None:

@@ -8,9 +8,11 @@ from functools import cached_property, partial
 
 import numpy as np
 
+from mpmcli.boundaries.rigid_motion import FAR
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.scene import BodyParticles, Scene, estimate_particles, sample_bodies
+from mpmcli.scene.colliders import Collider
 from mpmcli.solver.contact.layers import require_contact_possible
 from mpmcli.solver.drive.expressions import RunValues
 from mpmcli.solver.drive.forces import Drives, ExternalForces
@@ -509,7 +511,8 @@ class Run:
             stop(self, self.last_step)
         self._measure_forces(self.last_step)
         if self._control.fresh:
-            self._state.speed = self._control.speed
+            rigid = self.batch.device.rigid
+            self._state.speed = max(self._control.speed, 0.0 if rigid is None else rigid.fastest(self.slot))
 
     def _measure_forces(self, step: float) -> None:
         """Measure forces for the time until the next measurement, at most `state.longest` steps of `step`, s."""
@@ -572,6 +575,14 @@ class Run:
         self.batch.device.particles.forget_lost(self.slot * len(self.groups), len(self.groups))
         if self.grid.deterministic:
             self.grid.fixed.forget(self.slot)
+
+    def broken_body(self) -> Collider | None:
+        """Return the first rigid body whose pose is not finite, or None."""
+        if (rigid := self.batch.device.rigid) is None:
+            return None
+        poses = rigid.pose.to_numpy()[self.slot * rigid.count :][: rigid.count]
+        broken = np.flatnonzero(~(np.abs(poses) < FAR).all(axis=1))
+        return self.scene.colliders[rigid.free[broken[0]]] if len(broken) else None
 
     def lost(self) -> list[int | None]:
         """Return the solver index of a lost particle of each group, or None for a group without one."""

@@ -159,6 +159,7 @@ STEP: Mapping[str, Entry] = {
     "speed_squared": _real("kernel"),  # squared speed of the fastest node, m^2/s^2
     "rate": _real("kernel", per="group"),  # largest rate of deformation, 1/s
     "volume_change": _real("kernel", per="group"),  # largest change of the logarithm of a volume by relaxation
+    "broken": _real("kernel"),  # 1 if the pose of a rigid body is not finite, else 0
 }
 
 

@@ -56,7 +56,7 @@ class Diagnosis:
     Attributes:
         step: number of the step after which the fault was detected.
         time: time, s.
-        particle: row of the particle in every frame.
+        particle: row of the particle in every frame; None for a rigid body.
         body: name of its body.
         position: last position inside the domain, m.
         cause: the fault of the particle.
@@ -67,7 +67,7 @@ class Diagnosis:
 
     step: int
     time: float
-    particle: int
+    particle: int | None
     body: str
     position: tuple[float, ...]
     cause: str
@@ -77,8 +77,9 @@ class Diagnosis:
 
     def sentence(self) -> str:
         place = ", ".join(f"{x:.4g}" for x in self.position)
+        which = "rigid body" if self.particle is None else f"particle {self.particle} of body"
         return (
-            f"the run became unstable at step {self.step}, t = {self.time:.6g} s: particle {self.particle} of body "
+            f"the run became unstable at step {self.step}, t = {self.time:.6g} s: {which} "
             f'"{self.body}" at ({place}) m {self.cause}; the step was {self.step_size:.3g} s, the nearest limit '
             f'"{self.limit}"; {self.suggestion}.'
         )
@@ -94,6 +95,7 @@ class UnstableRunError(RunError):
 
 # Causes and suggestions.
 NOT_FINITE = "has a state that is not finite"
+POSE = "has a pose that is not finite"
 INVERTED = "was inverted"
 CRUSHED = "collapsed to zero volume"
 LEFT = "left the domain"
@@ -188,7 +190,15 @@ def diagnose(
 
 
 def stop(run: object, dt: float) -> NoReturn:
-    """Stop a `Run` at a lost particle, or if none is recorded at the first unsound one; `dt` is the step, s."""
+    """Stop a `Run` at a rigid body or a lost particle, or if neither is recorded at the first unsound particle.
+
+    `dt` is the step, s.
+    """
+    if (broken := run.broken_body()) is not None:
+        limit, advice = run.nearest_limit, SUGGESTIONS[NOT_FINITE]
+        place = tuple(np.array(broken.moments.center).tolist())
+        name, cause = broken.name, f"at the start {POSE}"
+        raise UnstableRunError(Diagnosis(run.step_count, run.time, None, name, place, cause, limit.name, dt, advice))
     for group, known in zip(run.groups, run.lost(), strict=True):
         snapshot = read_group(group)
         p = first_unsound(snapshot) if known is None else known
