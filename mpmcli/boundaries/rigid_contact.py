@@ -140,7 +140,7 @@ class RigidContact:
             bounces = self.restitution[run * colliders.capacity + own]
             if other >= 0:
                 bounces = ti.max(bounces, self.restitution[run * colliders.capacity + other])
-            approach = -self.velocity_of(run, q, colliders).dot(normal)
+            approach = -self.velocity_of(run, q, dt, colliders).dot(normal)
             if bounces > 0 and approach > 0:
                 # It separates at the end of this step or of the next, whichever is closer to the surface. Half of the
                 # velocity change by gravity and forces in the step comes before that, half after.
@@ -195,7 +195,7 @@ class RigidContact:
     @ti.func
     def push(self, run: int, q: int, dt: ti.f64, colliders: ti.template()):
         """Update the impulse at point q to satisfy its contact conditions; return the size of the change, N s."""
-        velocity = self.velocity_of(run, q, colliders)
+        velocity = self.velocity_of(run, q, dt, colliders)
         normal, before = self.normal[q], self.impulse[q]
         # A point on a hinge, or of a body that cannot move along the normal, does not yield.
         free = ti.cast(1, ti.f64) / self.bodies.mass[run * self.bodies.count + self.body[q]]
@@ -226,13 +226,16 @@ class RigidContact:
         return (after - before).norm()
 
     @ti.func
-    def velocity_of(self, run: int, q: int, colliders: ti.template()):
-        """Return the velocity of point q relative to its obstacle, m/s."""
+    def velocity_of(self, run: int, q: int, dt: ti.f64, colliders: ti.template()):
+        """Return the mean velocity of point q relative to its obstacle in a step of dt seconds, m/s.
+
+        With the velocity at its start, a box would tip over its edge with an error of first order.
+        """
         velocity = ti.Vector.zero(ti.f64, self.dimension)
         for s in range(2):
             b, arm, sign = self.side(run, q, s)
             if b >= 0:
-                velocity += sign * self.bodies.velocity_at(b, arm)
+                velocity += sign * self.bodies.velocity_at(b, arm, dt)
             elif self.other[q] >= 0:
                 i = run * colliders.capacity + self.other[q]
                 away = arm - ti.cast(colliders.place[i], ti.f64)

@@ -388,12 +388,13 @@ class RigidMotion:
         return load
 
     @ti.func
-    def velocity_at(self, b: int, arm: ti.template()):
-        """Return the velocity of body b at an arm from its centre."""
+    def velocity_at(self, b: int, arm: ti.template(), dt: ti.f64):
+        """Return the mean velocity of a point of body b, now at an arm, over dt seconds, to second order."""
         spin, result = ti.Vector.zero(ti.f64, self.turns), ti.Vector.zero(ti.f64, self.dimension)
         for a in ti.static(range(self.turns)):
             spin[a] = self.rate[b, ti.static(self.dimension + a)]
-        turning = self.crossed(spin) @ arm
+        cross = self.crossed(spin)
+        turning = cross @ (arm + 0.5 * dt * (cross @ arm))
         for a in ti.static(range(self.dimension)):
             result[a] = self.rate[b, a] + turning[a]
         return result

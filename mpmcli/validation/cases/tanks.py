@@ -198,8 +198,8 @@ class FloatingBox(Case):
         rows = [row for _, row in frames][STILL:]
         pose = np.array([row.rigid_pose[0] for row in rows]).mean(axis=0)
         mass = scene.colliders[0].moments.mass
-        # The volume below the level is that of the water and that displaced by the box.
-        level = (rows[0].mass + mass) / DENSITY / scene.domain.size[0]
+        # The volume below the level is that of the water, compressed from the start, and that displaced by the box.
+        level = (scene.bodies[0].shape.form.volume + mass / DENSITY) / scene.domain.size[0]
         force = float(np.mean([row.collider_force[0][1] for row in rows]))
         return {
             "draught error": (level - pose[1]) / BOX + 0.5 - SHARE,
