@@ -447,6 +447,7 @@ def test_a_gate_on_a_hinge_at_the_floor(backend_of: Callable, strength: float, h
     if holds:
         assert np.abs(angle).max() < 1e-6
         assert np.mean([row.collider_force[0][0] for row in rows[5:]]) == pytest.approx(push, rel=0.01)
+        assert np.mean([row.collider_torque[0][0] for row in rows[5:]]) == pytest.approx(-push * depth / 3, rel=0.02)
     else:
         assert angle[-1] < -1.0
 

@@ -70,7 +70,6 @@ def test_all_errors_come_at_once_in_the_order_of_the_file():
         'scene.toml:7: time.end: must be a number; found "long"',
         "scene.toml:8: time.frames: must be at least 1; found 0",
         'scene.toml:11: bodies[0].material.densty: unknown key; did you mean "density"?',
-        "scene.toml:11: bodies[0].material.densty: must be greater than 0; found -1000.0",
         "scene.toml:15: bodies[1].shape.ball.radius: must be greater than 0; found -0.5",
     ]
 

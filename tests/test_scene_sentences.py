@@ -27,6 +27,9 @@ REPLACED = [
         "8: time.duration: unknown key; the keys here are end, frames, safety and step",
     ),
     ("end = 1.5", "end = 1.5\nspacing = 3", "8: time.spacing: unknown key here; it belongs to [domain]"),
+    ("ball = {", "sphere = {", '15: bodies[1].shape.sphere: unknown key; did you mean "ball"?'),
+    # Nothing is said about the value of a key that was only guessed.
+    ('name = "drop"', 'name = "drop"\ndamping = 0.1', '15: bodies[1].damping: unknown key; did you mean "sampling"?'),
     ("[time]", "[tme]", '6: tme: unknown key; did you mean "time"?'),
     ("end = 1.5\n", "", "6: time.end: missing key: simulated time, s; the scene starts at 0"),
     ("end = 1.5", 'end = "1.5"', '7: time.end: must be a number; found "1.5"'),

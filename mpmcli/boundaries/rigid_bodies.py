@@ -195,6 +195,7 @@ class RigidBodies(RigidMotion):
             for a in ti.static(range(self.loads)):
                 self.support[b, a] = ti.cast(0, ti.f64)
             low, rows = self.rows_near(i)
+            push = ti.Vector.zero(ti.f64, self.dimension)
             for q in range(self.product(rows)):
                 row = (
                     run * self.colliders.loads.rows + self.row_at(low, rows, q)
@@ -202,7 +203,17 @@ class RigidBodies(RigidMotion):
                 for a in ti.static(range(self.loads)):
                     self.booked[b, a] = self.booked[b, a] + self.colliders.loads.taken[row][a]
                     self.momentum[b, a] = self.momentum[b, a] + self.colliders.loads.taken[row][a]
+                    if ti.static(a < self.dimension):
+                        push[a] += self.colliders.loads.taken[row][a]
                     self.colliders.loads.taken[row][a] = 0.0
+            if self.hinged[b] == 1:
+                # The torque about the hinge, which is that about the centre and this one.
+                arm = ti.Vector.zero(ti.f64, self.dimension)
+                for a in ti.static(range(self.dimension)):
+                    arm[a] = self.pose[b, a] - self.hinge[b][0, a]
+                load = self.load_of(push, arm)
+                for a in ti.static(range(self.dimension, self.loads)):
+                    self.booked[b, a] = self.booked[b, a] + load[a]
             self.take_rate(b)
             self.drive[b] = 0
             self.turn_motor(b, dt)

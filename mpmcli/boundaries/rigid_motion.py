@@ -32,7 +32,7 @@ class RigidMotion:
         pushes: a `RigidDrive`.
         pose: positions of the centres relative to the lower corner, m, and angles, rad, or unit quaternions.
         momentum: momentum, and angular momentum about the centre.
-        booked: impulses of the material since the last frame.
+        booked: impulses of the material since the last frame; angular ones about a hinge, or else the centre.
         rate: velocity and angular velocity, as found by the rounds of a step so far.
         settled: whether the rounds have converged.
         support: impulses of walls and other contacts in the last step, the estimate of the rounds for this step.

@@ -16,7 +16,7 @@ from typing import Any, Literal, NamedTuple
 from pydantic.json_schema import GenerateJsonSchema
 
 from mpmcli.scene.material import Knob, Laws, MaterialParameters, knobs_of, unit_of
-from mpmcli.scene.problem import Path, Problem, Renames, listed, nearest, quoted, written
+from mpmcli.scene.problem import Path, Problem, Renames, listed, nearest, quoted, rigid_hint, written
 from mpmcli.scene.schema import scene_model
 
 
@@ -124,7 +124,7 @@ class _Material:
         if word in known:
             return True
         if word not in others:
-            hint = f'did you mean "{guess}"? The' if (guess := nearest(word, known)) else "the"
+            hint = f'did you mean "{guess}"? The' if (guess := nearest(word, known)) else f"{rigid_hint(word)}the"
             sentence = f"unknown {kind} {written(word)}; {hint} {kind}s are {listed(quoted(known), 'and')}"
         elif kind == "law":
             sentence = f'"{word}" is a preset: write preset = "{word}"'

@@ -186,6 +186,8 @@ def _validate(
             found = [p for p in problems_of(error, expansion.data, model) if p.path[:3] not in expansion.faulty]
         if not unknown:
             found += expansion.problems + (problems_in(scene) if scene is not None else [])
+            # The value of an unknown key says nothing about the key that was guessed.
+            found = [p for p in found if not any(p.path[: len(guessed)] == guessed for guessed in renames)]
             return scene, problems + _as_written(found, expansion.renames, renames), expansion.notes
         unknown_paths, data, new = repaired(data, unknown, model)
         problems += _as_written([p for p in found if p.path in unknown_paths], expansion.renames, renames)

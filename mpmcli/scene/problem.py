@@ -81,9 +81,28 @@ def problems_of(error: ValidationError, data: dict[str, Any], model: type[BaseMo
     return [_problem(path, errors, model) for path, errors in by_path.items()]
 
 
+# Words of other programs, and ours.
+SYNONYMS = {
+    **dict.fromkeys(("sphere", "circle", "disc", "disk"), "ball"),
+    **dict.fromkeys(("cuboid", "cube", "rectangle", "rect", "square", "block"), "box"),
+    **dict.fromkeys(("liquid", "oil"), "water"),
+    **dict.fromkeys(("elastic", "gel", "foam", "soft"), "jelly"),
+    **dict.fromkeys(("steel", "iron", "copper"), "metal"),
+    **dict.fromkeys(("soil", "gravel", "granular"), "sand"),
+}
+RIGID = ("wood", "stone", "rock", "rigid", "concrete", "brick", "glass", "ice", "plastic")
+
+
 def nearest(word: str, known: list[str]) -> str | None:
-    """Return the known word that a misspelled one most likely means, or None."""
+    """Return the known word that a misspelled or foreign one most likely means, or None."""
+    if (ours := SYNONYMS.get(word.lower())) in known:
+        return ours
     return next(iter(difflib.get_close_matches(word.lower(), known, n=1)), None)
+
+
+def rigid_hint(word: str) -> str:
+    """Return an advice for the name of a material that is stiffer than a body can be, else ""."""
+    return "a collider with a density is a rigid body; " if word.lower() in RIGID else ""
 
 
 def hint_at(word: str, known: list[str], otherwise: str) -> str:
