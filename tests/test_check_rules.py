@@ -444,3 +444,44 @@ def test_a_rigid_body_that_liquid_cannot_lift_is_said(cells: float, fires: bool)
     assert len(found("no-liquid-between", [pool], colliders=[raft])) == fires
     dry = block("drop", [0.75, 0.5], [0.9, 0.75])
     assert found("no-liquid-between", [dry], colliders=[raft]) == []
+
+
+METAL = {"law": "von_mises", "density": 1000.0, "youngs_modulus": 1e6, "yield_stress": 1e4}
+LEFT, RIGHT, HEAP = box([0.1, 0.0], [0.3, 0.25]), box([0.6, 0.0], [0.8, 0.25]), box([0.2, 0.0], [0.8, 8 / 64])
+
+
+@pytest.mark.parametrize(
+    ("rule", "said", "other"),
+    [
+        ("units", {"domain": {"gravity": [0.0, -981.0]}}, {"domain": {"gravity": [0.0, -98.1]}}),
+        ("units", {"domain": {"gravity": [0.0, -9810.0]}}, {"domain": {"gravity": [0.0, -5000.0]}}),
+        ("gravity-up", {"domain": {"gravity": [0.0, 9.81]}}, {"domain": {"gravity": [9.81, 4.0]}}),
+        ("gravity-up", {"domain": {"gravity": [1.0, 9.81]}}, {"domain": {"gravity": ["1", "sin(60 * t)"]}}),
+        ("friction-coefficient", {"domain": {"friction": 30.0}}, {"domain": {"friction": 1.9}}),
+        (
+            "friction-coefficient",
+            {"colliders": [{"name": "ramp", "shape": RIGHT, "friction": 25.0}]},
+            {"colliders": [{"name": "ramp", "shape": RIGHT, "friction": 0.5}]},
+        ),
+        ("friction-angle", {"material": SAND | {"friction_angle": 0.6}}, {"material": GRAINS}),
+        ("low-heap", {"material": GRAINS, "shape": box([0.2, 0.0], [0.8, 0.1])}, {"material": GRAINS, "shape": HEAP}),
+        ("large-domain", {"domain": {"size": [10.0, 10.0], "cells": [640, 640]}}, {"domain": {"size": [2.0, 2.0]}}),
+        (
+            "welds",
+            {"bodies": [{"name": n, "material": METAL, "shape": s} for n, s in (("a", LEFT), ("b", RIGHT))]},
+            {"bodies": [{"name": n, "material": SOLID, "shape": s} for n, s in (("a", LEFT), ("b", RIGHT))]},
+        ),
+    ],
+)
+def test_numbers_in_other_units_or_of_another_kind(rule: str, said: dict, other: dict) -> None:
+    """What newcomers write in cm, in degrees for a coefficient, in radians for degrees; the rest is left alone."""
+    (finding,) = found(rule, **said)
+    assert finding.severity == ("note" if rule in ("low-heap", "large-domain", "welds") else "warning")
+    assert found(rule, **other) == []
+
+
+def test_hydrostatic_pressure_is_not_advised_where_it_is_refused() -> None:
+    """In a pool from wall to wall, with constant gravity and with gravity of time."""
+    pool = {"shape": box([0.0, 0.0], [1.0, 0.25])}
+    assert len(found("no-pressure", **pool)) == 1
+    assert found("no-pressure", **pool, domain={"gravity": ["sin(t)", "-10"]}) == []

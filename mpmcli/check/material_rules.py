@@ -137,6 +137,9 @@ def _unpressed(facts: SceneFacts) -> Iterator[Finding]:
         form, source = body.body.shape.form, body.body
         if body.law.deformation != "J" or source.initial_pressure or not isinstance(form, Box):
             continue
+        # Hydrostatic pressure is that of constant gravity.
+        if not facts.scene.domain.steady:
+            continue
         touched = touched_walls(facts.scene, form)
         level = all(all(faces) for a, faces in enumerate(touched) if a != axis)
         if level and touched[axis][side] and source.deformation is None and not np.any(source.velocity):

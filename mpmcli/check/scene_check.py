@@ -12,6 +12,7 @@ from mpmcli.check.material_rules import material_findings
 from mpmcli.check.scene_limits import SceneLimit
 from mpmcli.check.shape_rules import drive_findings, shape_findings
 from mpmcli.check.step_rules import loss_findings, rounding_findings, step_findings
+from mpmcli.check.unit_rules import unit_findings
 from mpmcli.cores import available_cores
 from mpmcli.errors import InputError
 from mpmcli.plain_text import counted, size_text, text_table
@@ -121,7 +122,7 @@ def check_scene(
     threads = threads or useful_threads(plan.particles, available_cores())
     forecast = forecast_of(facts, plan, probe, threads)
     rules = (step_findings, shape_findings, material_findings, drive_findings, loss_findings, rounding_findings)
-    findings = [finding for rule in rules for finding in rule(facts)]
+    findings = [finding for rule in (*rules, unit_findings) for finding in rule(facts)]
     findings += output_findings(facts, plan, forecast, directory)
     if probe is not None and probe.failure:
         unstable = f"The run became unstable within {probe.steps} steps of the probe"
