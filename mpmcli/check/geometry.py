@@ -7,7 +7,7 @@ from itertools import product
 import numpy as np
 
 from mpmcli.scene import Scene
-from mpmcli.scene.primitives import edge_distances
+from mpmcli.scene.primitives import TurnedBox, edge_distances
 from mpmcli.scene.shapes import Ball, Box, Capsule, Composite, Cylinder, Form, Mesh, Points, Polygon, distance_grid
 
 # Accuracy of the largest ball in a form, relative to the extent of the form, in 2D and 3D.
@@ -53,6 +53,8 @@ def thickness(form: Form, endless: Collection[int] = ()) -> float:
         return 2 * form.radius
     if isinstance(form, Cylinder):
         return min(2 * form.radius, form.height)
+    if isinstance(form, TurnedBox):
+        return 2 * min(form.half)
     if isinstance(form, Box):
         edges = [hi - lo for lo, hi in zip(form.min, form.max, strict=True)]
         return min((edge for a, edge in enumerate(edges) if a not in endless), default=max(edges))
@@ -106,7 +108,7 @@ def image_shifts(scene: Scene) -> np.ndarray:
 
 def distance_between(first: Form, second: Form) -> float:
     """Return the distance of two shapes that do not overlap, m; iterative for two cylinders, or box and cylinder."""
-    if any(isinstance(form, Composite | Mesh | Points) for form in (first, second)):
+    if any(isinstance(form, Composite | Mesh | Points | TurnedBox) for form in (first, second)):
         return _distance_by_search(first, second)
     pairs = ((first, second), (second, first))
     for ball, other in pairs:

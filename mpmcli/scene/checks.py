@@ -11,7 +11,7 @@ from mpmcli.scene.colliders import Collider, Plane, has_jump, slope_of
 from mpmcli.scene.entry import entries_in
 from mpmcli.scene.expression import Expression
 from mpmcli.scene.mesh import Mesh, leaving, moved_inside
-from mpmcli.scene.primitives import Polygon, grid_points
+from mpmcli.scene.primitives import Polygon, TurnedBox, grid_points
 from mpmcli.scene.problem import Problem, hint_at, listed
 from mpmcli.scene.quadrature import integral_of, parts_of
 from mpmcli.scene.quantity import AXES, place_text
@@ -150,7 +150,7 @@ def collider_problems(scene: Scene) -> Iterator[Problem]:
             continue
         yield from _out_of_reach(collider, k, scene)
         # Its distances are stored at nodes.
-        if isinstance(collider.form, Mesh | Composite | Polygon):
+        if isinstance(collider.form, Mesh | Composite | Polygon | TurnedBox):
             spans = np.ptp(np.array(collider.form.bounds()), axis=0) / scene.domain.spacing
             if not (count := float(np.prod(spans + 1))) <= _MOST_CELLS:
                 said = (

@@ -120,6 +120,12 @@ class ColliderShape(Shape):
 
     plane: Plane | None = Field(None, description="A half space: all points behind a plane.")
 
+    @model_validator(mode="after")
+    def _plane_has_its_normal(self) -> "ColliderShape":
+        if self.plane and self.rotation is not None:
+            raise flaw("has a normal; leave rotation out", "plane")
+        return self
+
 
 OneColliderShape = Annotated[
     ColliderShape, AfterValidator(exactly_one_form), Field(json_schema_extra={"minProperties": 1})

@@ -290,6 +290,13 @@ class Mesh(Table, Solid):
         """The closed surface, m."""
         return self._surface
 
+    def turned(self, turn: np.ndarray, center: np.ndarray) -> "Mesh":
+        """Return the mesh rotated about a point."""
+        result = self.model_copy()
+        vertices = center + (self._surface.vertices - center) @ turn.T
+        result._surface = ClosedSurface(vertices, self._surface.triangles)
+        return result
+
     @property
     def volume(self) -> float:
         return self._surface.volume

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
@@ -87,6 +88,32 @@ class Box(Table, Solid):
     def signed_distance(self, points: np.ndarray) -> np.ndarray:
         lo, hi = self.bounds()
         return _distance_to_edges(np.maximum(lo - points, points - hi))
+
+
+@dataclass(frozen=True)
+class TurnedBox(Solid):
+    """A box in 3D whose edges are not along the axes: its middle, half its edges, m, and its rotation by rows."""
+
+    middle: tuple[float, ...]
+    half: tuple[float, ...]
+    turn: tuple[tuple[float, ...], ...]
+
+    @property
+    def volume(self) -> float:
+        return math.prod(2 * edge for edge in self.half)
+
+    @property
+    def corners(self) -> np.ndarray:
+        """The corners, (8, 3), m, numbered as by `box_corners`."""
+        half = np.array(self.half)
+        return np.array(self.middle) + box_corners(-half, half) @ np.array(self.turn).T
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        return self.corners.min(axis=0), self.corners.max(axis=0)
+
+    def signed_distance(self, points: np.ndarray) -> np.ndarray:
+        own = (points - np.array(self.middle)) @ np.array(self.turn)
+        return _distance_to_edges(np.abs(own) - np.array(self.half))
 
 
 class Ball(Table, Solid):

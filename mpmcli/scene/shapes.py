@@ -1,18 +1,29 @@
 """Shapes: forms with volume, bounds, inside test and signed distance, and composites of forms."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import combinations, product
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, PrivateAttr, ValidationInfo, model_validator
 
-from mpmcli.scene.mesh import Mesh
+from mpmcli.scene.mesh import Mesh, Rotation
 from mpmcli.scene.points import Points
-from mpmcli.scene.primitives import Ball, Box, Capsule, Cylinder, Polygon, Solid, grid_points
-from mpmcli.scene.quantity import Table, flaw, scene_dimension
+from mpmcli.scene.primitives import (
+    Ball,
+    Box,
+    Capsule,
+    Cylinder,
+    Polygon,
+    Solid,
+    TurnedBox,
+    grid_points,
+    rotation,
+)
+from mpmcli.scene.quantity import Number, Table, Vector, flaw, scene_dimension
 
 # Cells of the coarsest lattice along the longest axis of the bounding box, and number of halvings of surface cells, in
 # 2D and 3D.
@@ -143,7 +154,35 @@ def _holds(outer: Solid, inner: Solid) -> bool:
     return False
 
 
-Form = Box | Ball | Capsule | Composite | Cylinder | Mesh | Points | Polygon
+Form = Box | Ball | Capsule | Composite | Cylinder | Mesh | Points | Polygon | TurnedBox
+
+
+def turned(form: Solid, turn: np.ndarray, center: np.ndarray) -> Solid:
+    """Return a form rotated about a point, (d,), m, by a rotation (d, d)."""
+
+    def moved(*points: Sequence[float]) -> list[tuple[float, ...]]:
+        return [tuple(point) for point in (center + (np.array(points) - center) @ turn.T).tolist()]
+
+    match form:
+        case Composite():
+            return Composite(*(tuple(turned(one, turn, center) for one in of) for of in (form.added, form.removed)))
+        case Ball():
+            return form.model_copy(update={"center": moved(form.center)[0]})
+        case Capsule():
+            start, end = moved(form.start, form.end)
+            return form.model_copy(update={"start": start, "end": end})
+        case Cylinder():
+            return form.model_copy(update={"base": moved(form.base)[0], "axis": tuple((turn @ form.axis).tolist())})
+        case Polygon():
+            return form.model_copy(update={"vertices": tuple(moved(*form.vertices))})
+        case Mesh():
+            return form.turned(turn, center)
+    lower, upper = form.bounds()
+    if len(lower) == 2:
+        (x0, y0), (x1, y1) = lower, upper
+        return Polygon.model_construct(vertices=tuple(moved((x0, y0), (x1, y0), (x1, y1), (x0, y1))))
+    (middle,) = moved((lower + upper) / 2)
+    return TurnedBox(middle, tuple(((upper - lower) / 2).tolist()), tuple(map(tuple, turn.tolist())))
 
 
 def _only_in(dimension: int, instead: str) -> Any:
@@ -156,7 +195,15 @@ def _only_in(dimension: int, instead: str) -> Any:
     return BeforeValidator(check)
 
 
-COMBINED = ("add", "subtract")
+def _fits_dimension(rotated: object, info: ValidationInfo) -> object:
+    d = scene_dimension(info)
+    if rotated is not None and d is not None and (d == 3) != isinstance(rotated, dict | Rotation):
+        right = "{ axis = [x, y, z], angle = degrees }" if d == 3 else "an angle, degrees,"
+        raise flaw(f"must be {right} in {d}D")
+    return rotated
+
+
+COMBINED = ("add", "subtract", "rotation", "center")
 
 
 def exactly_one_form(shape: "Shape") -> "Shape":
@@ -190,10 +237,39 @@ class Shape(Table):
     )
     add: Others = Field(None, description="Shapes added to the form. Default: none.")
     subtract: Others = Field(None, description="Shapes subtracted from the form and the added shapes. Default: none.")
+    rotation: Annotated[Number | Rotation | None, BeforeValidator(_fits_dimension)] = Field(
+        None, description="Rotation of the whole: an angle, degrees, in 2D; a table of axis and angle in 3D."
+    )
+    center: Vector | None = Field(
+        None, description="Point about which it rotates, m. Default: the middle of the bounding box."
+    )
+    _whole: Any = PrivateAttr(None)
+
+    @model_validator(mode="after")
+    def _center_is_of_a_rotation(self) -> "Shape":
+        if self.rotation is None and self.center is not None:
+            raise flaw("is the centre of a rotation; give rotation as well", "center")
+        return self
 
     @property
     def form(self) -> Form:
-        """The given form, or its composite with other shapes."""
+        """The given form, or its composite with other shapes, rotated."""
+        if self.rotation is None:
+            return self._upright
+        if self._whole is None:
+            form, rotated = self._upright, self.rotation
+            center = np.mean(form.bounds(), axis=0) if self.center is None else np.array(self.center)
+            if isinstance(rotated, Rotation):
+                turn = rotation(rotated.axis, math.radians(rotated.angle))
+            else:
+                s, c = math.sin(math.radians(rotated)), math.cos(math.radians(rotated))
+                turn = np.array([[c, -s], [s, c]])
+            self._whole = turned(form, turn, center)
+        return self._whole
+
+    @property
+    def _upright(self) -> Form:
+        """The form before it is rotated."""
         single = next(form for name, form in self if form is not None and name not in COMBINED)
         if not (self.add or self.subtract):
             return single
@@ -213,8 +289,8 @@ class BodyShape(Shape):
 
     @model_validator(mode="after")
     def _points_are_alone(self) -> "BodyShape":
-        if self.points and (self.add or self.subtract):
-            raise flaw("are particles as they are; leave add and subtract out", "points")
+        if self.points and (self.add or self.subtract or self.rotation is not None):
+            raise flaw("are particles as they are; leave add, subtract and rotation out", "points")
         return self
 
     @property

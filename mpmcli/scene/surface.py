@@ -10,7 +10,7 @@ import numpy as np
 
 from mpmcli.scene.colliders import Collider, Plane
 from mpmcli.scene.mesh import Mesh
-from mpmcli.scene.primitives import Ball, Box, Capsule, Cylinder, Polygon, box_corners
+from mpmcli.scene.primitives import Ball, Box, Capsule, Cylinder, Polygon, TurnedBox, box_corners
 from mpmcli.scene.sampling import first_come
 
 if TYPE_CHECKING:
@@ -183,6 +183,8 @@ def form_surface(form: Any) -> Surface:
         return _turned(np.array(form.base), form.direction, np.array([[h, 0.0], [h, r], [0.0, r], [0.0, 0.0]]))
     if isinstance(form, Mesh):
         return Surface(form.surface.vertices, form.surface.triangles)
+    if isinstance(form, TurnedBox):
+        return _cuboid(form.corners)
     return level_surface(form.signed_distance, *form.bounds())
 
 
@@ -239,6 +241,11 @@ def _box(lower: np.ndarray, upper: np.ndarray) -> Surface:
     corners = box_corners(lower, upper)
     if len(lower) == 2:
         return ring(corners[[0, 1, 3, 2]])
+    return _cuboid(corners)
+
+
+def _cuboid(corners: np.ndarray) -> Surface:
+    """Return the surface of a cuboid from its corners, (8, 3), numbered as by `box_corners`."""
     return Surface(corners, np.array([t for a, b, c, e in BOX for t in ((a, b, c), (a, c, e))], dtype=np.int64))
 
 
