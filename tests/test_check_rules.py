@@ -485,3 +485,19 @@ def test_hydrostatic_pressure_is_not_advised_where_it_is_refused() -> None:
     pool = {"shape": box([0.0, 0.0], [1.0, 0.25])}
     assert len(found("no-pressure", **pool)) == 1
     assert found("no-pressure", **pool, domain={"gravity": ["sin(t)", "-10"]}) == []
+
+
+@pytest.mark.parametrize(
+    ("speed", "count", "needed"), [(0.6, 4, 9), (0.6, 9, None), (1.4, 4, 16), (0.2, 4, None), (-0.2, 4, None)]
+)
+def test_grips_that_pull_a_body_apart(speed: float, count: int, needed: int | None) -> None:
+    """Of 0.3 m between two grips: to twice and 3.3 times that in 0.5 s, and less; what has more particles holds."""
+    grips = [
+        {"name": "fixed", "wall": "hold", "shape": box([0.0, 0.0], [0.2, 0.5])},
+        {"name": "grip", "wall": "hold", "shape": box([0.5, 0.0], [0.7, 0.5]), "velocity": [speed, 0.0]},
+    ]
+    bar = {"material": SOLID, "shape": box([0.1, 0.2], [0.6, 0.4]), "particles_per_cell": count}
+    findings = found("pulled", **bar, domain={"gravity": [0.0, 0.0]}, colliders=grips)
+    assert len(findings) == (needed is not None)
+    if needed:
+        assert f"Set particles_per_cell = {needed}, " in findings[0].fix

@@ -225,12 +225,14 @@ class StretchCheck(FrameCheck):
 
     START: ClassVar = {"neighbour_distance": None}
     _pairs: list[tuple[BodyHeader, np.ndarray, np.ndarray, float]] | None = None
+    # Per body, the largest distance of neighbours before it tears, cells.
+    _held: dict[str, float]
 
     def check(self, frame: Frame) -> None:
         """Check a frame of finite values."""
         header, h = self._header, self._header.spacing
         if self._pairs is None:
-            self._pairs = [] if h is None else list(self._neighbours(frame, h))
+            self._pairs, self._held = [] if h is None else list(self._neighbours(frame, h)), {}
         for body, first, second, allowed in self._pairs:
             apart = nearest_image(frame.position[second] - frame.position[first], header.period)
             squares = np.einsum("ij,ij->i", apart, apart)
@@ -239,13 +241,17 @@ class StretchCheck(FrameCheck):
             if cells <= allowed:
                 continue
             severity = "warning" if cells > TORN else "note"
+            if severity == "note":
+                self._held[body.name] = max(cells, self._held.get(body.name, 0.0))
             count = int((squares > (allowed * h) ** 2).sum())
             told = f"farther than {TORN:g}, the reach of a kernel: it has torn, although its material cannot"
             if severity == "note":
                 told = f"above {allowed:.3g}: the grid hardly resolves motion between them, noise grows, and gaps open"
             what = f'In frame {frame.index} {count} pairs of neighbours of body "{body.name}"'
             what += f" stand up to {cells:.3g} cells apart, {told}"
-            per_axis = int(np.ceil(body.particles_per_cell ** (1 / header.dimension) * cells / STRETCHED))
+            # Of a body that has torn, the distance before it did.
+            reached = self._held.get(body.name, TORN) if severity == "warning" else cells
+            per_axis = int(np.ceil(body.particles_per_cell ** (1 / header.dimension) * reached / STRETCHED))
             fix = f"Set particles_per_cell = {per_axis**header.dimension}, or stretch it less."
             self._findings.add(severity, "stretch", frame.index, what, fix, cells, body.name, kind=body.name)
 

@@ -6,6 +6,7 @@ Resolution: thin bodies, gaps, distance from walls, particles per cell, and stre
 
 import math
 from collections.abc import Iterator
+from itertools import combinations
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from mpmcli.check.geometry import close_pairs
 from mpmcli.check.result_state import STRETCHED, TORN
 from mpmcli.scene import Scene
 from mpmcli.scene.bounds import body_points
+from mpmcli.scene.colliders import Motion
 from mpmcli.scene.domain import PERIODIC
 from mpmcli.scene.primitives import grid_points
 from mpmcli.scene.problem import quoted, several
@@ -43,13 +45,15 @@ TIGHT, CRUSHED = 0.95, 0.25
 BEGINS_INSIDE = 0.1
 # Cells between a rigid body and the body below it from which on liquid enters the gap.
 UNDER = 1.0
+# Stretch beside a grip over that of the body between two grips, as measured for a bar pulled to twice its length.
+UNEVEN = 1.11
 # Points along the longest axis of the lattice that measures room, and number of instants of the run.
 POINTS, INSTANTS = {2: 96, 3: 32}, 33
 
 
 def shape_findings(facts: SceneFacts) -> Iterator[Finding]:
     """Yield the findings on shapes and their particles."""
-    for rule in (_thin, _gaps, _sticking, _walls, _particles, _stretched):
+    for rule in (_thin, _gaps, _sticking, _walls, _particles, _stretched, _pulled):
         yield from rule(facts)
 
 
@@ -164,6 +168,53 @@ def _stretched(facts: SceneFacts) -> Iterator[Finding]:
         more = f"Set particles_per_cell = {math.ceil(stretch / STRETCHED) ** d}, or start" if stretch < 10 else "Start"
         fix = f"{more} it slower or less deformed."
         yield Finding("warning" if cells > TORN else "note", "stretch", what, fix, cells, body.name)
+
+
+def _pulled(facts: SceneFacts) -> Iterator[Finding]:
+    """Yield the distances to which colliders that hold two parts of an elastic body will pull its particles apart."""
+    scene, d = facts.scene, facts.scene.dimension
+    grips = [collider for collider in scene.colliders if collider.wall == "hold" and not collider.free]
+    if not any(collider.driven for collider in grips):
+        return
+    for body in facts.bodies:
+        if not body.law.coherent or body.law.projects or body.law.deformation == "J":
+            continue
+        points = body_points(body.body)
+        parts = [(grip.motion, points[grip.form.contains(points)]) for grip in grips]
+        stretches = [pulled for pair in combinations(parts, 2) if (pulled := _pull(*pair, scene.time.end))]
+        stretch = max(stretches, default=1.0)
+        cells = UNEVEN * stretch * body.body.particles_per_cell ** (-1 / d)
+        if cells <= STRETCHED or stretch <= 1.0:
+            continue
+        what = (
+            f'Colliders pull body "{body.name}" to {stretch:.3g} times its length between them, so that its particles '
+            f"come to stand {cells:.3g} cells apart beside them: above {STRETCHED:g} they let go of it."
+        )
+        fix = f"Set particles_per_cell = {math.ceil(UNEVEN * stretch / STRETCHED) ** d}, or pull it less."
+        yield Finding("warning", "pulled", what, fix, cells, body.name)
+
+
+def _pull(first: tuple[Motion, np.ndarray], second: tuple[Motion, np.ndarray], end: float) -> float:
+    """Return the largest ratio of the distance of two held parts of a body to that at the start; 0 if not both hold."""
+    (one, held), (other, gripped) = first, second
+    if not len(held) or not len(gripped):
+        return 0.0
+    from scipy.spatial import KDTree
+
+    away, nearest = KDTree(held).query(gripped)
+    k = int(np.argmin(away))
+    ends = (one, held[nearest[k]]), (other, gripped[k])
+    apart = [
+        float(np.linalg.norm(np.subtract(*(_carried(motion, point, time) for motion, point in ends))))
+        for time in np.linspace(0.0, end, INSTANTS).tolist()
+    ]
+    return max(apart) / apart[0] if apart[0] > 0 else 0.0
+
+
+def _carried(motion: Motion, point: np.ndarray, time: float) -> np.ndarray:
+    """Return where a point of a collider, given as it is without `offset`, is at a time, s."""
+    place, turn = motion.pose(time)
+    return place + turn @ (point - np.array(motion.pivot))
 
 
 def _stretch_to_come(facts: SceneFacts, body: BodyFacts) -> float:
