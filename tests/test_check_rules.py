@@ -501,3 +501,30 @@ def test_grips_that_pull_a_body_apart(speed: float, count: int, needed: int | No
     assert len(findings) == (needed is not None)
     if needed:
         assert f"Set particles_per_cell = {needed}, " in findings[0].fix
+
+
+GRIP = {"name": "grip", "wall": "hold", "shape": box([0.0, 0.4], [0.15, 0.8])}
+BOUNCY = {"name": "ball", "density": 500.0, "shape": {"ball": {"center": [0.8, 0.5], "radius": 0.1}}}
+DRUM = {"name": "drum", "side": "inside", "shape": {"ball": {"center": [0.5, 0.5], "radius": 0.4}}}
+
+
+@pytest.mark.parametrize(
+    ("rule", "said", "other"),
+    [
+        # A beam that falls, and one that is held.
+        ("impact-loss", {}, {"colliders": [GRIP]}),
+        # Sand above a slippery floor, and in a drum.
+        ("slippery", {"material": GRAINS}, {"material": GRAINS, "colliders": [DRUM]}),
+        ("restitution", {"colliders": [BOUNCY | {"restitution": 0.5}]}, {"colliders": [BOUNCY]}),
+    ],
+)
+def test_what_concerns_a_body_is_said_and_nothing_else(rule: str, said: dict, other: dict) -> None:
+    block = {"material": SOLID, "shape": box([0.3, 0.4], [0.6, 0.5]), "time": {"end": 1.0}}
+    beam = block | ({"shape": box([0.1, 0.5], [0.6, 0.6])} if rule == "impact-loss" else {})
+    assert len(found(rule, **(beam | said))) == 1
+    assert found(rule, **(beam | other)) == []
+
+
+def test_half_the_spacing_is_not_said_to_leave_all_of_a_loss() -> None:
+    (finding,) = found("dissipation", material=SOLID, time={"end": 500.0, "frames": 10})
+    assert "100 %" not in finding.fix

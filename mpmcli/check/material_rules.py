@@ -9,6 +9,7 @@ from mpmcli.check.facts import BodyFacts, SceneFacts
 from mpmcli.check.finding import Finding
 from mpmcli.check.geometry import touched_walls
 from mpmcli.plain_text import plain_number
+from mpmcli.scene.bounds import body_points
 from mpmcli.scene.primitives import Box
 from mpmcli.scene.quantity import AXES
 
@@ -121,7 +122,7 @@ def _slippery(facts: SceneFacts) -> Iterator[Finding]:
     (axis, side), domain = _floor(facts), facts.scene.domain
     if side is None or domain.walls.faces(facts.scene.dimension)[axis][side] not in ("slip", "separate"):
         return
-    gripping = [body.name for body in facts.bodies if _grips(body)]
+    gripping = [body.name for body in facts.bodies if _grips(body) and not _contained(facts, body)]
     if gripping and domain.frictions[axis][side] == 0:
         face = f"{AXES[axis]}_{('min', 'max')[side]}"
         fix = f'Set domain.walls = {{ {face} = "stick" }}, or domain.friction = {{ {face} = 0.5 }}, if it should not.'
@@ -157,6 +158,12 @@ def _floor(facts: SceneFacts) -> tuple[int, int | None]:
     gravity = np.nan_to_num(facts.scene.domain.gravity_at(0.0))
     axis = int(np.abs(gravity).argmax())
     return axis, int(gravity[axis] > 0) if gravity.any() else None
+
+
+def _contained(facts: SceneFacts, body: BodyFacts) -> bool:
+    """Return whether a body starts inside a container, away from the walls."""
+    containers = [collider.form for collider in facts.scene.colliders if collider.side == "inside"]
+    return any(form.contains(body_points(body.body)).all() for form in containers)
 
 
 def _grips(body: BodyFacts) -> bool:

@@ -11,7 +11,7 @@ from mpmcli.check.forecast import damped_step, expected_steps, steps_at, wave_lo
 from mpmcli.check.geometry import spanned_axes, touched_walls
 from mpmcli.check.material_rules import LOCKING
 from mpmcli.plain_text import plain_number
-from mpmcli.scene.bounds import highest_speed
+from mpmcli.scene.bounds import body_points, highest_speed
 from mpmcli.scene.schema import USUAL_FLIP, SolverSettings
 from mpmcli.scene.shapes import Ball, Box, Form, Points
 from mpmcli.stability.transfer_factors import impact_loss, loss_per_step, step_inertia
@@ -32,6 +32,8 @@ CONSEQUENCE = {
 }
 # Fractions of energy lost by a wave in the run, and dissipated by viscosity, above which they matter.
 NOTED_LOSS = 0.1
+# Fraction of energy that is all of it in a message.
+ALL = 0.995
 # Fraction of the given viscosity, or of the energy of an impact, above which the scheme's own loss is reported.
 NOTED_SHARE = 0.02
 # Largest relative rounding error of a number of 32 bits.
@@ -124,7 +126,10 @@ def _dissipation(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
         f'body "{body.name}", {body.thickness / h:.3g} cells thick, in a second, and {_percent(lost)} in the run.'
     )
     # A wave loses an eighth: a sixteenth in each of twice as many steps.
-    fix = f"Half the spacing lowers that to {_percent(-math.expm1(-rate * end / 8))} in the run"
+    finer = -math.expm1(-rate * end / 8)
+    fix = f"Half the spacing lowers that to {_percent(finer)} in the run"
+    if finer > ALL:
+        fix = "Slower motions of the whole body lose less; where waves across it matter, refine the domain"
     if getattr(body.body.material, "poissons_ratio", 0.0) > LOCKING:
         fix += f", and longer steps with poissons_ratio = {LOCKING:g} or less lower it as well"
     yield Finding("note", "dissipation", what, f"{fix}.", rate, body.name)
@@ -164,8 +169,8 @@ def _viscosity(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
 def _impact(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
     scene, velocity = facts.scene, np.array(body.arrival.impact)
     speed = float(np.linalg.norm(velocity))
-    # A body whose stiffness vanishes has no waves.
-    if speed == 0 or body.stiffness == 0:
+    # A body whose stiffness vanishes has no waves, and one that is held does not fall.
+    if speed == 0 or body.stiffness == 0 or _held(facts, body):
         return
     waves = math.sqrt(body.stiffness / body.body.material.density)
     h, mach = scene.domain.spacing, speed / waves
@@ -193,6 +198,12 @@ def _impact(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
     )
     fix = _cure(facts, lost(scene.solver, h / 2), None if surfaces else lost(_aflip(scene.solver), h))
     yield Finding("note", "impact-loss", what, fix, now, body.name)
+
+
+def _held(facts: SceneFacts, body: BodyFacts) -> bool:
+    """Return whether a collider holds a part of a body at the start."""
+    grips = [collider.form for collider in facts.scene.colliders if collider.wall == "hold"]
+    return any(form.contains(body_points(body.body)).any() for form in grips)
 
 
 def _cure(facts: SceneFacts, finer: float, aflip: float | None) -> str:

@@ -22,7 +22,7 @@ HEAP = 8.0
 
 def unit_findings(facts: SceneFacts) -> Iterator[Finding]:
     """Yield the findings on numbers that look wrong."""
-    for rule in (_gravity, _friction, _angle, _room, _heap, _welds):
+    for rule in (_gravity, _friction, _angle, _room, _heap, _welds, _restitution):
         yield from rule(facts)
 
 
@@ -100,3 +100,13 @@ def _welds(facts: SceneFacts) -> Iterator[Finding]:
         what = f"The bodies {several(quoted(solid))} can flow: where they meet they stick, and become one."
         fix = "Make those that need not deform elastic, or colliders with a density."
         yield Finding("note", "welds", what, fix, len(solid), solid[0])
+
+
+def _restitution(facts: SceneFacts) -> Iterator[Finding]:
+    """Yield rigid bodies with a coefficient of restitution among bodies of material, which it does not concern."""
+    bouncing = [one for one in facts.scene.colliders if one.free and one.restitution > 0]
+    if bouncing and facts.bodies:
+        one = bouncing[0]
+        what = f'The restitution of "{one.name}" acts where it meets walls, colliders and rigid bodies, not material.'
+        fix = "A rebound from material follows from the stiffness and losses of the material."
+        yield Finding("note", "restitution", what, fix, one.restitution, one.name)
