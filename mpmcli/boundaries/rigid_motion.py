@@ -125,7 +125,10 @@ class RigidMotion:
             turned = self.turned(b)
             for a in ti.static(range(d)):
                 self.colliders.place[i][a] = ti.cast(self.pose[b, a], float)
-            push = pull + kick * self.pushes.acceleration(j, self.colliders.place[i], self.start[b], run)
+            v = ti.Vector.zero(float, d)
+            for a in ti.static(range(d)):
+                v[a] = ti.cast(self.rate[b, a], float)
+            push = self.pushes.change(j, self.colliders.place[i], self.start[b], v, pull, kick, run)
             self.motor[b] = ti.cast(self.pushes.motor(j, run), ti.f64)
             for a in ti.static(range(d)):
                 self.kick[b][a] = ti.cast(push[a], ti.f64)

@@ -24,7 +24,7 @@ from mpmcli.scene import BodyParticles, Scene, sample_bodies, scene_to_toml
 from mpmcli.scene.colliders import Collider, Plane
 from mpmcli.scene.entry import value_of
 from mpmcli.scene.expand import PRESETS
-from mpmcli.scene.expression import INITIAL, POSITION, evaluate
+from mpmcli.scene.expression import INITIAL, POSITION, VELOCITY, evaluate
 from mpmcli.scene.schema import Emitter, usual_particles_per_cell
 from mpmcli.scene.sheets import sheets_of
 
@@ -281,7 +281,9 @@ def _loads(scene: Scene, found: Sequence[BodyParticles]) -> Iterator[tuple[np.nd
     for force in scene.forces:
         if force.body in loaded:
             position, mass = loaded[force.body]
-            places = dict(zip((*POSITION[: scene.dimension], *INITIAL), [*position.T] * 2, strict=False))
+            # At rest.
+            places = dict.fromkeys(VELOCITY, 0.0)
+            places |= dict(zip((*POSITION[: scene.dimension], *INITIAL), [*position.T] * 2, strict=False))
             forces = (
                 mass * np.stack([value_of(a, t=t, **places) + 0.0 * position[:, 0] for a in force.acceleration], axis=1)
                 for t in np.linspace(0.0, scene.time.end, LOAD_TIMES)

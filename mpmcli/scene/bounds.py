@@ -7,7 +7,7 @@ from itertools import product
 import numpy as np
 
 from mpmcli.scene.entry import Entry, value_of, varies
-from mpmcli.scene.expression import INITIAL, POSITION, Apply, Expression, Tree, bounds_of, names_in
+from mpmcli.scene.expression import INITIAL, POSITION, VELOCITY, Apply, Expression, Tree, bounds_of, names_in
 from mpmcli.scene.material import SceneBounds
 from mpmcli.scene.points import Points
 from mpmcli.scene.primitives import grid_points
@@ -151,7 +151,9 @@ def _cells(scene: Scene, places: np.ndarray, way: float) -> tuple[np.ndarray, np
 
 def _largest(force: Force, time: float, x: np.ndarray, X: np.ndarray) -> float:
     """Return the largest finite magnitude at a time, s, of particles at x that started at X, m/s^2."""
-    values = dict(zip(POSITION, x.T, strict=False)) | dict(zip(INITIAL, X.T, strict=False))
+    # Forces that depend on the velocity are those at rest: what slows a body down adds nothing.
+    values = dict.fromkeys(VELOCITY, 0.0)
+    values |= dict(zip(POSITION, x.T, strict=False)) | dict(zip(INITIAL, X.T, strict=False))
     squares = np.asarray(sum(np.square(value_of(entry, t=time, **values)) for entry in force.acceleration))
     # Values that are not finite occur at no particle, or stop the run.
     return float(np.max(squares, initial=0.0, where=np.isfinite(squares))) ** 0.5
@@ -164,7 +166,7 @@ def _search(
     d = low.shape[1]
     instant = np.float64(time)
     for _ in range(HALVINGS):
-        ranges = {"t": (instant, instant)}
+        ranges = {name: (np.float64(0.0),) * 2 for name in VELOCITY} | {"t": (instant, instant)}
         ranges |= {name: (low[:, a], high[:, a]) for a, name in enumerate(POSITION[:d])}
         ranges |= {name: (begun[0][a], begun[1][a]) for a, name in enumerate(INITIAL[:d])}
         squares = np.zeros(len(low))

@@ -16,6 +16,7 @@ from mpmcli.scene.expression import (
     INITIAL,
     POSITION,
     QUANTITIES,
+    VELOCITY,
     Expression,
     ExpressionError,
     Number,
@@ -34,10 +35,13 @@ def entry_of(*names: str) -> Any:
     def read(value: object, info: ValidationInfo) -> Entry:
         """Return a number or the expression of a text; a constant expression gives its number."""
         if isinstance(value, str):
-            missing = () if scene_dimension(info) != 2 else (POSITION[2], INITIAL[2])
+            missing = () if scene_dimension(info) != 2 else (POSITION[2], INITIAL[2], VELOCITY[2])
+            constants = info.context.get("constants", {})
             try:
-                known = [name for name in names if name not in missing]
-                value = parse(value, known, info.context.get("constants", {}))
+                known = [name for name in names if name not in missing and not (name in VELOCITY and name in constants)]
+                if set(VELOCITY) & set(names):
+                    constants = {"speed": speed_of(scene_dimension(info) or 2)} | constants
+                value = parse(value, known, constants)
             except ExpressionError as error:
                 raise flaw(str(error)) from None
         if isinstance(value, Expression):
@@ -87,12 +91,20 @@ def varies(*entries: Entry) -> bool:
     return any(isinstance(entry, Expression) for entry in entries)
 
 
+def speed_of(dimension: int) -> ast.expr:
+    """Return the magnitude of the velocity as a constant of expressions."""
+    squares = " + ".join(f"{name}**2" for name in VELOCITY[:dimension])
+    return ast.parse(f"sqrt({squares})", mode="eval").body
+
+
 OfTime = entry_of("t")
 OfPlace = entry_of("t", *POSITION, *INITIAL)
+OfMotion = entry_of("t", *POSITION, *INITIAL, *VELOCITY)
 OfStart = entry_of(*INITIAL)
 
 TimeVector = list_of_axes(OfTime, zeros=True)
 PlaceVector = list_of_axes(OfPlace)
+MotionVector = list_of_axes(OfMotion)
 StartVector = list_of_axes(OfStart, zeros=True)
 StartMatrix = list_of_axes(list_of_axes(OfStart))
 # J, or F as rows.

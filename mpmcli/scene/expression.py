@@ -20,6 +20,8 @@ import numpy as np
 POSITION = ("x", "y", "z")
 INITIAL = ("X", "Y", "Z")
 QUANTITIES = ("t", *POSITION, *INITIAL)
+# In forces alone; constants may have these names.
+VELOCITY = ("vx", "vy", "vz")
 CONSTANTS = {"pi": math.pi, "e": math.e}
 # Largest number of arguments of a variadic function.
 MANY = 64

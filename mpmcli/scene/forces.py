@@ -4,8 +4,8 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
-from mpmcli.scene.entry import Entry, PlaceVector
-from mpmcli.scene.expression import INITIAL, POSITION, Expression
+from mpmcli.scene.entry import Entry, MotionVector
+from mpmcli.scene.expression import INITIAL, POSITION, VELOCITY, Expression
 from mpmcli.scene.expression_reader import parse
 from mpmcli.scene.primitives import Ball, Box
 from mpmcli.scene.quantity import NAME, NotNegative, Number, Positive, Table, Vector, flaw
@@ -96,12 +96,12 @@ class Force(Table):
 
     name: str | None = Field(None, pattern=NAME, description="Name of the force, for --set.")
     body: str | None = Field(None, description="Name of the body or rigid body that it acts on. Default: all of them.")
-    acceleration: PlaceVector | None = Field(
+    acceleration: MotionVector | None = Field(
         None,
-        description="m/s^2, one entry per axis: numbers, or expressions of the time t (s), the position x, y, z "
-        "and the initial position X, Y, Z of a particle (m).",
+        description="m/s^2, one entry per axis: numbers, or expressions of the time t (s), the position x, y, z, the "
+        "initial position X, Y, Z (m) and the velocity vx, vy, vz (m/s) of a particle; speed is that of the velocity.",
     )
-    force: PlaceVector | None = Field(
+    force: MotionVector | None = Field(
         None,
         description="N (2D: per metre of depth), in place of the acceleration: spread evenly over the mass of the "
         "body, or of its part in the region.",
@@ -126,8 +126,7 @@ class Force(Table):
         scale = "" if self.force is None else f" * {1 / mass!r}"
         where = f" if {self.region.condition} else 0" if self.region else ""
         texts = [entry.text if isinstance(entry, Expression) else repr(entry) for entry in given]
-        axes = POSITION[: len(given)], INITIAL[: len(given)]
-        names = ("t", *axes[0], *axes[1])
+        names = ("t", *(name for axes in (POSITION, INITIAL, VELOCITY) for name in axes[: len(given)]))
         entries = tuple(0.0 if text == "0.0" else parse(f"({text}){scale}{where}", names, {}) for text in texts)
         return self.model_copy(update={"acceleration": entries, "force": None, "region": None})
 

@@ -19,7 +19,7 @@ from taichi.lang import ops
 
 from mpmcli.boundaries.doubles import double_field
 from mpmcli.quick_taichi import ti
-from mpmcli.scene.expression import INITIAL, POSITION, Apply, Name, Number, Tree, names_in
+from mpmcli.scene.expression import INITIAL, POSITION, VELOCITY, Apply, Name, Number, Tree, names_in
 from mpmcli.scene.quadrature import BOUND, COEFFICIENTS, COLUMNS, HALF, LOW, MIDDLE, WINDOWS, Mean, telling_times
 
 # Integer powers up to this exponent are computed as products, because powers of negative numbers are undefined on some
@@ -70,6 +70,8 @@ class Entries:
         return Apply(function, tuple(self.placed(argument) for argument in arguments))
 
     def _coordinate(self, name: Name) -> Tree:
+        if name.name in VELOCITY:
+            return name
         names = INITIAL if name.name in INITIAL else POSITION
         return Apply("+", (name, self.number(self._origin[names.index(name.name)])))
 
@@ -374,19 +376,23 @@ KERNELS |= {
 }
 
 
+# Index of the velocity behind the initial position.
+MOVES = 3
+
+
 @ti.data_oriented
 class Coordinate:
-    """A coordinate of the position or of the initial position."""
+    """A coordinate of the position, of the initial position, or of the velocity."""
 
     def __init__(self, axis: int, *, initial: bool) -> None:
         self.axis, self.initial = axis, initial
 
     @ti.func
     def evaluate(self, x: ti.template(), X: ti.template(), run: int):
-        value = x[self.axis]
         if ti.static(self.initial):
-            value = X[self.axis]
-        return value
+            return X[self.axis]
+        else:
+            return x[self.axis]
 
 
 @ti.data_oriented
@@ -435,10 +441,15 @@ class Application:
 
 
 def node_of(tree: "Tree | Place", values: DeviceValues) -> object:
-    """Return the node that evaluates a tree of `Entries` at x and X, (d,), m, with the numbers of a run."""
+    """Return the node that evaluates a tree of `Entries` at x and X, (d,), m, with the numbers of a run.
+
+    For a tree of the velocity, X has it from entry MOVES on, m/s.
+    """
     if isinstance(tree, Place):
         return Reading(values, tree.index)
     if isinstance(tree, Name):
+        if tree.name in VELOCITY:
+            return Coordinate(MOVES + VELOCITY.index(tree.name), initial=True)
         names = INITIAL if tree.name in INITIAL else POSITION
         return Coordinate(names.index(tree.name), initial=names is INITIAL)
     exponent = whole_power(tree)

@@ -11,13 +11,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mpmcli.materials.elementary import exp_minus_1
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
 from mpmcli.scene.entry import tree_of
-from mpmcli.scene.expression import INITIAL, POSITION, Number, Tree, names_in
+from mpmcli.scene.expression import INITIAL, POSITION, VELOCITY, Number, Tree, apply, derivative, names_in
 from mpmcli.scene.quadrature import largest_of
 from mpmcli.scene.schema import Force
-from mpmcli.solver.drive.expressions import DeviceValues, Entries, Place, RunValues, TimeTables, node_of
+from mpmcli.solver.drive.expressions import MOVES, DeviceValues, Entries, Place, RunValues, TimeTables, node_of
 from mpmcli.solver.machine.backend import Backend
 from mpmcli.solver.particles.arrays import ParticleArrays
 from mpmcli.solver.particles.state_bounds import build_maxima
@@ -57,11 +58,12 @@ class Term:
 
     Attributes:
         place: index of the body in its group, -1 for all bodies.
-        axes: each axis along which the force acts, with its tree.
+        axes: each axis along which the force acts, with its tree, and that of its decrease with the velocity along the
+            axis, or None if it does not depend on that.
     """
 
     place: int
-    axes: tuple[tuple[int, Tree | Place], ...]
+    axes: tuple[tuple[int, Tree | Place, Tree | Place | None], ...]
 
 
 @dataclass(frozen=True)
@@ -70,15 +72,19 @@ class ForceTerms:
 
     Attributes:
         terms: the forces.
-        moves, initial: whether any of them depends on the position, and on the initial position.
+        moves, initial, drags: whether any of them depends on the position, on the initial position, and on the
+            velocity.
         reach, slope: half of the interval of differences, m, and the inverse of the interval, 1/m; None without forces.
+        gravity: gravity along each axis if any force depends on the velocity, else empty.
     """
 
     terms: tuple[Term, ...] = ()
     moves: bool = False
     initial: bool = False
+    drags: bool = False
     reach: Place | None = None
     slope: Place | None = None
+    gravity: tuple[Tree | Place, ...] = ()
 
     @staticmethod
     def of(scene: Scene, names: Sequence[str], entries: Entries) -> "ForceTerms":
@@ -89,17 +95,30 @@ class ForceTerms:
         terms, found = [], set()
         for force in forces:
             trees = [tree_of(entry) for entry in force.acceleration]
-            axes = tuple((axis, entries.placed(tree)) for axis, tree in enumerate(trees) if tree != Number(0.0))
+            axes = tuple(
+                (axis, entries.placed(tree), _decrease(tree, axis, entries))
+                for axis, tree in enumerate(trees)
+                if tree != Number(0.0)
+            )
             terms.append(Term(-1 if force.body is None else names.index(force.body), axes))
             found.update(*map(names_in, trees))
-        reach = REACH * scene.domain.spacing
+        reach, drags = REACH * scene.domain.spacing, not found.isdisjoint(VELOCITY)
         return ForceTerms(
             tuple(terms),
             not found.isdisjoint(POSITION),
             not found.isdisjoint(INITIAL),
+            drags,
             entries.number(reach),
             entries.number(0.5 / reach),
+            tuple(entries.placed(tree_of(entry)) for entry in scene.domain.gravity) if drags else (),
         )
+
+
+def _decrease(tree: Tree, axis: int, entries: Entries) -> Tree | Place | None:
+    """Return the placed tree of -da/dv along an axis, 1/s, or None if the tree does not depend on v there."""
+    if VELOCITY[axis] not in names_in(tree):
+        return None
+    return entries.placed(apply("negative", derivative(tree, VELOCITY[axis])))
 
 
 @dataclass(frozen=True)
@@ -231,11 +250,35 @@ class Gravity:
         return result
 
 
-def _nodes_of(forces: ForceTerms, values: DeviceValues) -> tuple[tuple[int, tuple[tuple[int, object], ...]], ...]:
-    """Return per force the index of its body, and each axis along which it acts with the node that evaluates it."""
+def _nodes_of(
+    forces: ForceTerms, values: DeviceValues, *, decreases: bool = False
+) -> tuple[tuple[int, tuple[tuple[int, object], ...]], ...]:
+    """Return per force the index of its body, and each axis along which it acts with the node that evaluates it.
+
+    With `decreases`, the nodes of -da/dv.
+    """
     return tuple(
-        (term.place, tuple((axis, node_of(tree, values)) for axis, tree in term.axes)) for term in forces.terms
+        (
+            term.place,
+            tuple(
+                (axis, node_of(slope if decreases else tree, values))
+                for axis, tree, slope in term.axes
+                if not decreases or slope is not None
+            ),
+        )
+        for term in forces.terms
     )
+
+
+@ti.func
+def decay(rate: float, kick: float):
+    """Return (1 - exp(-z)) / z with z = rate kick, or 1 if it is negative: the mean of a decay over a kick, s.
+
+    A change of velocity by kick a times this, where a falls with the velocity at this rate, is exact if a is linear in
+    it, and stable for any kick (exponential Euler; Hochbruck and Ostermann 2010).
+    """
+    z = ti.select(rate > 0.0, rate * kick, 0.0)
+    return ti.select(z > 0.0, -exp_minus_1(-z) / ti.select(z > 0.0, z, 1.0), 1.0)
 
 
 @ti.data_oriented
@@ -250,14 +293,17 @@ class GroupForce:
     def __init__(self, dimension: int, forces: ForceTerms, values: DeviceValues, room: int) -> None:
         """Build the nodes; `room` is the capacity for bodies per run in the group."""
         self.dimension, self.terms = dimension, _nodes_of(forces, values)
+        self.drags, self.decreases = forces.drags, _nodes_of(forces, values, decreases=True)
+        self.known = MOVES + dimension if forces.drags else dimension
+        self.gravity = tuple(node_of(tree, values) for tree in forces.gravity)
         self.moves, self.spreads = forces.moves, forces.moves and not forces.initial
         self.reach, self.slope = node_of(forces.reach, values), node_of(forces.slope, values)
         self.capacity = room
 
     @ti.func
-    def at(self, group: ti.template(), p: int, x: ti.template(), X: ti.template()):
+    def at(self, terms: ti.template(), group: ti.template(), p: int, x: ti.template(), X: ti.template()):
         result = ti.Vector.zero(float, self.dimension)
-        for place, axes in ti.static(self.terms):
+        for place, axes in ti.static(terms):
             if ti.static(place < 0):
                 for axis, node in ti.static(axes):
                     result[axis] += node.evaluate(x, X, group.run)
@@ -268,20 +314,25 @@ class GroupForce:
         return result
 
     @ti.func
-    def acceleration(self, group: ti.template(), p: int, with_slope: ti.template()):
+    def acceleration(self, group: ti.template(), p: int, kick: float, with_slope: ti.template()):
         """Return the acceleration a of particle p and da/dx at fixed X, d x d, which is 0 without `with_slope`.
 
         Central differences at the scale of the grid are exact if a is quadratic in x. With a force linear in x a body
-        moves affinely up to its surface.
+        moves affinely up to its surface. What depends on the velocity is a mean over a kick, s, see `decay`, in which
+        gravity acts as well; the nodes add gravity itself. The change of the velocity gradient is added to da/dx.
         """
         d = ti.static(self.dimension)
-        x, X, a = ti.Vector.zero(float, d), ti.Vector.zero(float, d), ti.Vector.zero(float, d)
+        x, X, a = ti.Vector.zero(float, d), ti.Vector.zero(float, self.known), ti.Vector.zero(float, d)
         slope = ti.Matrix.zero(float, d, d)
         here = group.place(p)
         for c in ti.static(range(d)):
             x[c] = here[c]
             if ti.static(group.keeps_initial):
                 X[c] = group.initial[p][c]
+        v, C = group.motion(p)
+        if ti.static(self.drags):
+            for c in ti.static(range(d)):
+                X[MOVES + c] = v[c]
         if ti.static(self.moves and with_slope):
             reach, inverse = self.reach.evaluate(x, X, group.run), self.slope.evaluate(x, X, group.run)
             # A loop, so that the expressions are compiled once: forwards and backwards along each axis, then at x
@@ -293,7 +344,7 @@ class GroupForce:
                         place[b] += reach
                     if k == 2 * b + 1:
                         place[b] -= reach
-                value = self.at(group, p, place, X)
+                value = self.at(self.terms, group, p, place, X)
                 for b, c in ti.static(ti.ndrange(d, d)):
                     if k == 2 * b:
                         slope[c, b] += value[c] * inverse
@@ -304,7 +355,15 @@ class GroupForce:
             for b, c in ti.static(ti.ndrange(d, d)):
                 slope[c, b] = ti.select(ti.abs(slope[c, b]) < STEEPEST, slope[c, b], 0.0)
         else:
-            a = self.at(group, p, x, X)
+            a = self.at(self.terms, group, p, x, X)
+        if ti.static(self.drags):
+            rates = self.at(self.decreases, group, p, x, X)
+            for c in ti.static(range(d)):
+                left, rate = decay(rates[c], kick), ti.select(rates[c] > 0.0, rates[c], 0.0)
+                pull = self.gravity[c].evaluate(x, X, group.run)
+                a[c] = (a[c] + pull) * left - pull
+                for b in ti.static(range(d)):
+                    slope[c, b] = left * (slope[c, b] - rate * C[c, b])
         return a, slope
 
 
@@ -314,13 +373,42 @@ class RigidDrive:
 
     def __init__(self, dimension: int, drives: Drives, values: DeviceValues) -> None:
         self.dimension, self.terms = dimension, _nodes_of(drives.rigid, values)
+        self.drags, self.decreases = drives.rigid.drags, _nodes_of(drives.rigid, values, decreases=True)
+        self.known = MOVES + dimension if self.drags else dimension
         self.motors = tuple((j, node_of(rate, values)) for j, rate in drives.motors)
 
     @ti.func
-    def acceleration(self, j: int, x: ti.template(), X: ti.template(), run: int):
-        """Return the acceleration of the j-th body with its centre at x, initially at X."""
+    def change(
+        self,
+        j: int,
+        x: ti.template(),
+        start: ti.template(),
+        v: ti.template(),
+        pull: ti.template(),
+        kick: float,
+        run: int,
+    ):
+        """Return the change of velocity of the j-th body in a kick, s, its centre at x, initially at `start`.
+
+        Gravity alone changes it by `pull`, m/s.
+        """
+        X = ti.Vector.zero(float, self.known)
+        for c in ti.static(range(self.dimension)):
+            X[c] = start[c]
+            if ti.static(self.drags):
+                X[MOVES + c] = v[c]
+        result = pull + kick * self.summed(self.terms, j, x, X, run)
+        if ti.static(self.drags):
+            rates = self.summed(self.decreases, j, x, X, run)
+            for c in ti.static(range(self.dimension)):
+                result[c] = result[c] * decay(rates[c], kick)
+        return result
+
+    @ti.func
+    def summed(self, terms: ti.template(), j: int, x: ti.template(), X: ti.template(), run: int):
+        """Return the sum of terms for the j-th body."""
         result = ti.Vector.zero(float, self.dimension)
-        for place, axes in ti.static(self.terms):
+        for place, axes in ti.static(terms):
             if place < 0 or place == j:
                 for axis, node in ti.static(axes):
                     result[axis] += node.evaluate(x, X, run)
@@ -342,7 +430,7 @@ def build_push(group: ParticleArrays, backend: Backend) -> Push:
 
     @ti.func
     def widen_one(own: ti.template(), view: ti.template(), p: int):
-        a, slope = view.force.acceleration(view, p, True)
+        a, slope = view.force.acceleration(view, p, 0.0, True)
         own[0] = ti.max(own[0], a.norm_sqr())
         for c in ti.static(range(view.dimension)):
             row = 0.0

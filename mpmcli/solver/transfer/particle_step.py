@@ -111,7 +111,7 @@ def loads_on(particles: ti.template(), g: ti.template(), group: ti.template(), p
     if ti.static(group.uses_f_bar):
         missing = missing_to_mean(particles.grid, g, group, p)
     if ti.static(group.has_body_force):
-        push, slope = group.force.acceleration(group, p, group.force.spreads)
+        push, slope = group.force.acceleration(group, p, kick, group.force.spreads)
     if ti.static(particles.has_contact):
         touch = particles.contact.push(group, p, particles.grid.spacing, particles.run)
     if ti.static(group.has_wall_friction):
