@@ -4,6 +4,7 @@ The points of a lattice that lie in a shape are too many or too few by those of 
 between rows. All particles of a body have the same mass, so that its density inside would be wrong by as much.
 """
 
+from collections.abc import Callable, Iterable
 from itertools import product
 
 import numpy as np
@@ -19,8 +20,11 @@ THIN = 0.9
 _CELLS_AT_ONCE = 2**14
 _GOLDEN = (5**0.5 - 1) / 2
 
+# Points, one in each cell that may lie in a form, (n, d), m, and the middles of these cells; some at a time.
+Sample = Iterable[tuple[np.ndarray, np.ndarray]]
 
-def fitted(form: Solid, points: np.ndarray, middles: np.ndarray, cell: np.ndarray) -> np.ndarray:
+
+def fitted(form: Solid, sample: Callable[[], Sample], cell: np.ndarray) -> np.ndarray:
     """Return the points of a sample that fill a form, (k, d), m, with k |cell| its volume.
 
     If those inside are too many or too few, the cells with the largest share inside the form are chosen, and of equal
@@ -29,25 +33,26 @@ def fitted(form: Solid, points: np.ndarray, middles: np.ndarray, cell: np.ndarra
 
     Args:
         form: the form.
-        points: a point in each cell that may lie in the form, (n, d), m.
-        middles: the middles of these cells, (n, d), m.
+        sample: returns the sample, the same at each call.
         cell: the edges of a cell, a row each, (d, d), m.
     """
-    inside = form.contains(points)
+    inside = np.concatenate([points[form.contains(points)] for points, _ in sample()])
     wanted = form.volume / abs(np.linalg.det(cell))
-    if abs(inside.sum() - wanted) <= CLOSE * wanted:
-        return points[inside]
+    if abs(len(inside) - wanted) <= CLOSE * wanted:
+        return inside
     d = len(cell)
-    fine = (np.array(list(product(range(FINE[d]), repeat=d))) + 0.5) / FINE[d] - 0.5
-    shares = _shares(form, middles, cell, fine @ cell)
+    fine = ((np.array(list(product(range(FINE[d]), repeat=d))) + 0.5) / FINE[d] - 0.5) @ cell
+    # The middle and the corners of a cell.
+    probes = np.vstack([np.zeros(d), np.array(list(product((-0.5, 0.5), repeat=d))) @ cell])
+    points, middles, shares, pairs = _filled(form, sample, probes, fine)
     if shares.sum() < THIN * wanted:
-        shares = _shares(form, middles, None, fine @ cell)
-    chosen = _chosen(shares, wanted)
+        points, middles, shares, pairs = _filled(form, sample, None, fine)
+    chosen = _chosen(shares, pairs, wanted)
     if not len(chosen):
-        return points[inside]
-    found = points[chosen].copy()
-    for k in np.flatnonzero(~inside[chosen]):
-        places = middles[chosen[k]] + fine @ cell
+        return inside
+    found = points[chosen]
+    for k in np.flatnonzero(~form.contains(found)):
+        places = middles[chosen[k]] + fine
         places = places[form.contains(places)]
         found[k] = places[np.argmin(np.sum((places - found[k]) ** 2, axis=1))]
     if abs(len(found) - wanted) <= CLOSE * wanted:
@@ -57,37 +62,41 @@ def fitted(form: Solid, points: np.ndarray, middles: np.ndarray, cell: np.ndarra
     return np.where(form.contains(stretched)[:, None], stretched, found)
 
 
-def _shares(form: Solid, middles: np.ndarray, cell: np.ndarray | None, fine: np.ndarray) -> np.ndarray:
-    """Return the share of each cell inside a form, (n,), by counting `fine` points.
+def _filled(
+    form: Solid, sample: Callable[[], Sample], probes: np.ndarray | None, fine: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return points and middles of the cells that a form meets, their shares in it, (n,), and numbers of their pairs.
 
-    With the edges of the cells it is all or nothing if the corners and the middle of a cell are alike.
+    A share is that of the `fine` places; with `probes` it is all or nothing if these are alike. Opposite cells of a
+    lattice make a pair.
     """
-    d = middles.shape[1]
-    corners = np.zeros((1, d))
-    if cell is not None:
-        corners = np.vstack([corners, np.array(list(product((-0.5, 0.5), repeat=d))) @ cell])
-    shares = np.empty(len(middles))
-    for first in range(0, len(middles), _CELLS_AT_ONCE):
-        some = middles[first : first + _CELLS_AT_ONCE]
-        probes = form.contains((some[:, None] + np.vstack([corners, np.zeros(d)])).reshape(-1, d)).reshape(
-            len(some), -1
-        )
-        own = probes.all(axis=1).astype(float)
-        cut = np.flatnonzero(probes.any(axis=1) & ~probes.all(axis=1) if cell is not None else np.ones(len(some)))
-        own[cut] = form.contains((some[cut, None] + fine).reshape(-1, d)).reshape(len(cut), -1).mean(axis=1)
-        shares[first : first + len(some)] = own
-    return shares
+    found, total = [], 0
+    for all_points, all_middles in sample():
+        for first in range(0, len(all_middles), _CELLS_AT_ONCE):
+            rows = slice(first, first + _CELLS_AT_ONCE)
+            points, middles = all_points[rows], all_middles[rows]
+            shares, cut = np.zeros(len(middles)), np.arange(len(middles))
+            if probes is not None:
+                within = _contains(form, middles, probes)
+                shares, cut = within.all(axis=1).astype(float), np.flatnonzero(within.any(axis=1) & ~within.all(axis=1))
+            shares[cut] = _contains(form, middles[cut], fine).mean(axis=1)
+            met = np.flatnonzero(shares)
+            found.append((points[met], middles[met], shares[met], total + met))
+            total += len(middles)
+    points, middles, shares, numbers = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    return points, middles, shares, np.minimum(numbers, total - 1 - numbers)
 
 
-def _chosen(shares: np.ndarray, wanted: float) -> np.ndarray:
-    """Return the numbers, ascending, of the cells with the largest shares, `wanted` of them up to a half or `CLOSE`."""
-    n = len(shares)
-    # Opposite cells of a lattice have the numbers k and n - 1 - k.
-    pairs = np.minimum(np.arange(n), n - 1 - np.arange(n))
+def _contains(form: Solid, middles: np.ndarray, offsets: np.ndarray) -> np.ndarray:
+    """Return whether each place of each cell lies in a form, (n, k)."""
+    places = (middles[:, None] + offsets).reshape(-1, middles.shape[1])
+    return form.contains(places).reshape(len(middles), len(offsets))
+
+
+def _chosen(shares: np.ndarray, pairs: np.ndarray, wanted: float) -> np.ndarray:
+    """Return the indices, ascending, of the cells with the largest shares, `wanted` of them up to a half or `CLOSE`."""
     order = np.lexsort((pairs * _GOLDEN % 1.0, -shares))
-    order = order[shares[order] > 0.0]
-    falls = np.flatnonzero(np.diff(shares[order])) + 1
-    ends = np.append(falls, len(order))
-    whole = ends[np.argmin(np.abs(ends - wanted))] if len(order) else 0
+    ends = np.append(np.flatnonzero(np.diff(shares[order])) + 1, len(order))
+    whole = ends[np.argmin(np.abs(ends - wanted))]
     count = whole if abs(whole - wanted) <= CLOSE * wanted else max(1, round(wanted))
     return np.sort(order[:count])

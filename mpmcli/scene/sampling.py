@@ -406,11 +406,11 @@ def particle_places(body: Body, index: int, h: float) -> np.ndarray:
         return points[form.contains(points)]
     if body.sampling == "turned":
         return _turned(body, h)
-    points, middles = (np.concatenate(found) for found in zip(*_lattice(body, index, h), strict=True))
     if isinstance(form, Box):
-        return points
+        return np.concatenate([points for points, _ in _lattice(body, index, h)])
     lower, upper = form.bounds()
-    return fitted(form, points, middles, np.diag((upper - lower) / _lattice_counts(body, h)))
+    cell = np.diag((upper - lower) / _lattice_counts(body, h))
+    return fitted(form, lambda: _lattice(body, index, h), cell)
 
 
 def _turned(body: Body, h: float) -> np.ndarray:
@@ -420,7 +420,7 @@ def _turned(body: Body, h: float) -> np.ndarray:
     if isinstance(form, Box):
         return turned_box(lower, upper, np.array(_lattice_counts(body, h)))
     points = (lower + upper) / 2 + spacing * turned_points((upper - lower) / (2 * spacing) + 1)
-    return fitted(form, points, points, spacing * turned_axes(len(lower)).T)
+    return fitted(form, lambda: [(points, points)], spacing * turned_axes(len(lower)).T)
 
 
 def _sample(body: Body, index: int, domain: Domain) -> BodyParticles:
