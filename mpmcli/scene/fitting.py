@@ -28,8 +28,9 @@ def fitted(form: Solid, sample: Callable[[], Sample], cell: np.ndarray) -> np.nd
     """Return the points of a sample that fill a form, (k, d), m, with k |cell| its volume.
 
     If those inside are too many or too few, the cells with the largest share inside the form are chosen, and of equal
-    cells that cannot all be chosen some, spread evenly and in opposite pairs. A chosen point outside moves to the
-    nearest counted place of its cell inside. A remaining error above `CLOSE` stretches the sample about its middle.
+    cells that cannot all be chosen some, spread evenly, each with its images in the middle planes of the form, so that
+    its centre of mass stays. A chosen point outside moves to the nearest counted place of its cell inside. A remaining
+    error above `CLOSE` stretches the sample about its middle.
 
     Args:
         form: the form.
@@ -44,12 +45,14 @@ def fitted(form: Solid, sample: Callable[[], Sample], cell: np.ndarray) -> np.nd
     fine = ((np.array(list(product(range(FINE[d]), repeat=d))) + 0.5) / FINE[d] - 0.5) @ cell
     # The middle and the corners of a cell.
     probes = np.vstack([np.zeros(d), np.array(list(product((-0.5, 0.5), repeat=d))) @ cell])
-    points, middles, shares, pairs = _filled(form, sample, probes, fine)
+    points, middles, shares = _filled(form, sample, probes, fine)
     if shares.sum() < THIN * wanted:
-        points, middles, shares, pairs = _filled(form, sample, None, fine)
-    chosen = _chosen(shares, pairs, wanted)
-    if not len(chosen):
+        points, middles, shares = _filled(form, sample, None, fine)
+    if not len(points):
         return inside
+    middle = np.mean(form.bounds(), axis=0)
+    away = np.round(np.abs(middles - middle) / np.ptp(form.bounds(), axis=0), 6)
+    chosen = _chosen(shares, np.unique(away, axis=0, return_inverse=True)[1].reshape(-1), wanted)
     found = points[chosen]
     for k in np.flatnonzero(~form.contains(found)):
         places = middles[chosen[k]] + fine
@@ -57,20 +60,18 @@ def fitted(form: Solid, sample: Callable[[], Sample], cell: np.ndarray) -> np.nd
         found[k] = places[np.argmin(np.sum((places - found[k]) ** 2, axis=1))]
     if abs(len(found) - wanted) <= CLOSE * wanted:
         return found
-    middle = np.mean(form.bounds(), axis=0)
     stretched = middle + (wanted / len(found)) ** (1 / d) * (found - middle)
     return np.where(form.contains(stretched)[:, None], stretched, found)
 
 
 def _filled(
     form: Solid, sample: Callable[[], Sample], probes: np.ndarray | None, fine: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return points and middles of the cells that a form meets, their shares in it, (n,), and numbers of their pairs.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return points and middles of the cells that a form meets, and their shares in it, (n,).
 
-    A share is that of the `fine` places; with `probes` it is all or nothing if these are alike. Opposite cells of a
-    lattice make a pair.
+    A share is that of the `fine` places; with `probes` it is all or nothing if these are alike.
     """
-    found, total = [], 0
+    found = []
     for all_points, all_middles in sample():
         for first in range(0, len(all_middles), _CELLS_AT_ONCE):
             rows = slice(first, first + _CELLS_AT_ONCE)
@@ -81,10 +82,9 @@ def _filled(
                 shares, cut = within.all(axis=1).astype(float), np.flatnonzero(within.any(axis=1) & ~within.all(axis=1))
             shares[cut] = _contains(form, middles[cut], fine).mean(axis=1)
             met = np.flatnonzero(shares)
-            found.append((points[met], middles[met], shares[met], total + met))
-            total += len(middles)
-    points, middles, shares, numbers = (np.concatenate(parts) for parts in zip(*found, strict=True))
-    return points, middles, shares, np.minimum(numbers, total - 1 - numbers)
+            found.append((points[met], middles[met], shares[met]))
+    points, middles, shares = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    return points, middles, shares
 
 
 def _contains(form: Solid, middles: np.ndarray, offsets: np.ndarray) -> np.ndarray:
@@ -93,10 +93,16 @@ def _contains(form: Solid, middles: np.ndarray, offsets: np.ndarray) -> np.ndarr
     return form.contains(places).reshape(len(middles), len(offsets))
 
 
-def _chosen(shares: np.ndarray, pairs: np.ndarray, wanted: float) -> np.ndarray:
-    """Return the indices, ascending, of the cells with the largest shares, `wanted` of them up to a half or `CLOSE`."""
-    order = np.lexsort((pairs * _GOLDEN % 1.0, -shares))
-    ends = np.append(np.flatnonzero(np.diff(shares[order])) + 1, len(order))
-    whole = ends[np.argmin(np.abs(ends - wanted))]
-    count = whole if abs(whole - wanted) <= CLOSE * wanted else max(1, round(wanted))
+def _chosen(shares: np.ndarray, images: np.ndarray, wanted: float) -> np.ndarray:
+    """Return the indices, ascending, of about `wanted` cells with the largest shares.
+
+    Cells with the same number in `images` and the same share stay together.
+    """
+    order = np.lexsort((images, images * _GOLDEN % 1.0, -shares))
+    falls, changes = np.diff(shares[order]) != 0, np.diff(images[order]) != 0
+    for splits in (falls, falls | changes):
+        ends = np.append(np.flatnonzero(splits) + 1, len(order))
+        count = int(ends[np.argmin(np.abs(ends - wanted))])
+        if abs(count - wanted) <= CLOSE * wanted:
+            break
     return np.sort(order[:count])
