@@ -133,7 +133,9 @@ def test_relaxed_particles_stay_in_their_shape_and_keep_their_mass(name, way):
     assert moved.count == raw.count
     assert moved.count * moved.mass == pytest.approx(1000 * form.volume, rel=1e-12)
     away = np.linalg.norm(moved.position - raw.position, axis=1)
-    assert 0.01 * H < away.max() < H and len(np.unique(moved.position, axis=0)) == moved.count
+    assert away.max() < H and len(np.unique(moved.position, axis=0)) == moved.count
+    # A turned lattice fills the nodes inside of a shape as it is, to the tolerance of relaxing.
+    assert away.max() > 0.01 * H or way == "turned"
 
 
 @pytest.mark.parametrize("shift", [0.0, 0.3])
