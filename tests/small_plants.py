@@ -103,7 +103,7 @@ DRIVES = (
     *_of(
         "scene/sampling.py",
         ("volume, body.material.density * volume", "volume, 1.05 * body.material.density * volume", "bar_fixed_fixed"),
-        ("volume = form.volume / len(position)", "volume = 1.05 * form.volume / len(position)", "conservation"),
+        ("volume = rest_volume(", "volume = 1.05 * rest_volume(", "conservation"),
     ),
     *_of(
         "scene/sampling.py",
