@@ -385,7 +385,7 @@ def test_a_hinge_takes_no_angular_momentum(backend_of: Callable) -> None:
 
 @pytest.mark.parametrize(("floor", "tilt"), [("stick", 3.0), ("stick", 10.0), ("slip", 3.0)])
 def test_a_box_tips_over_its_edge(backend_of: Callable, floor: str, tilt: float) -> None:
-    """As the pendulum above its edge, which rests or slides, does: 0.3 % at steps of 9 ms, which are the default."""
+    """As the pendulum above its edge, which rests or slides, does: 0.2 % at steps of 9 ms, which are the default."""
     width, height, tilt = 0.2, 0.4, math.radians(tilt)
     lean = tilt + math.atan2(width, height)
     turned = turned_by(np.array([[-lean]]))[0]
@@ -409,7 +409,7 @@ def test_a_box_tips_over_its_edge(backend_of: Callable, floor: str, tilt: float)
         domain={"size": [1.6, 1.2], "walls": floor},
     )
     poses, _ = moved(asked, backend_of("f64", 1))
-    assert -poses[:, 0, 2] == pytest.approx(exact, rel=3e-3, abs=1e-12)
+    assert -poses[:, 0, 2] == pytest.approx(exact, rel=2e-3, abs=1e-12)
 
 
 @pytest.mark.parametrize(("strength", "holds"), [(1.25, True), (0.8, False)])

@@ -13,6 +13,13 @@ from mpmcli.scene.primitives import Solid
 from mpmcli.scene.primitives import rotation as rotation_about
 from mpmcli.scene.surface import form_surface
 
+
+@pytest.fixture(autouse=True)
+def _away_from_the_checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let `refusal` write its scene elsewhere."""
+    monkeypatch.chdir(tmp_path)
+
+
 TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
 BALL_2D, BALL_3D = ({"ball": {"center": [0.3] * d, "radius": 0.15}} for d in (2, 3))
 SHAPES = {
@@ -101,6 +108,17 @@ def test_a_rotation_that_does_not_fit_is_one_sentence(written: str, said: str) -
     box = "shape = { box = { min = [0.0, 0.0], max = [1.0, 1.0] } }"
     (line,) = refusal(GOOD.replace(box, box[:-2] + written))
     assert said in line
+
+
+def test_a_rotation_of_a_rotated_shape(tmp_path: Path) -> None:
+    """In a composite that is rotated as well: a box turned forth and back is the box."""
+    axis, inner = [1.0, 2.0, -1.0], {"box": {"min": [0.8, 0.3, 0.4], "max": [1.0, 0.5, 0.8]}}
+    there, back = ({"rotation": {"axis": axis, "angle": angle}, "center": [0.2] * 3} for angle in (35.0, -35.0))
+    far = {"ball": {"center": [0.3] * 3, "radius": 0.1}, "add": [inner | there]} | back
+    form = scene_of(far, 3, tmp_path).bodies[0].shape.form
+    places = np.random.default_rng(0).uniform(0.7, 1.1, (2000, 3))
+    box = scene_of(inner, 3, tmp_path).bodies[0].shape.form
+    assert form.signed_distance(places) == pytest.approx(box.signed_distance(places), abs=1e-9)
 
 
 def test_a_plane_has_its_normal() -> None:

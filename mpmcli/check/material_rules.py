@@ -161,7 +161,7 @@ def _floor(facts: SceneFacts) -> tuple[int, int | None]:
 
 
 def _contained(facts: SceneFacts, body: BodyFacts) -> bool:
-    """Return whether a body starts inside a container, away from the walls."""
+    """Return whether a body starts inside a container."""
     containers = [collider.form for collider in facts.scene.colliders if collider.side == "inside"]
     return any(form.contains(body_points(body.body)).all() for form in containers)
 

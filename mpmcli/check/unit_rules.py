@@ -51,7 +51,7 @@ def _friction(facts: SceneFacts) -> Iterator[Finding]:
     for friction in sorted({friction for friction in found.values() if friction > ROUGH}):
         names = several([name for name, own in found.items() if own == friction])
         what = f"The friction of {names} is {friction:.3g}: a coefficient is the tangent of an angle, about 0.5."
-        fix = 'A surface that "stick"s holds material at any load.'
+        fix = 'Use "stick" for a surface that holds material at any load.'
         if friction < 90:
             fix = f"For an angle of {friction:.3g} degrees give {math.tan(math.radians(friction)):.3g}."
         yield Finding("warning", "friction-coefficient", what, fix, friction)
@@ -93,7 +93,7 @@ def _heap(facts: SceneFacts) -> Iterator[Finding]:
 
 
 def _welds(facts: SceneFacts) -> Iterator[Finding]:
-    """Yield plastic solids apart from each other, which share a velocity field and join where they meet."""
+    """Yield plastic solids, which share a velocity field and join where they meet."""
     plastic = (one for one in facts.bodies if one.law.deformation == "F" and one.law.projects)
     solid = [one.name for one in plastic if one.body.material.law != "sand"]
     if len(solid) > 1:

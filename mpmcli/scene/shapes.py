@@ -177,6 +177,9 @@ def turned(form: Solid, turn: np.ndarray, center: np.ndarray) -> Solid:
             return form.model_copy(update={"vertices": tuple(moved(*form.vertices))})
         case Mesh():
             return form.turned(turn, center)
+        case TurnedBox():
+            edges = turn @ np.array(form.turn)
+            return TurnedBox(moved(form.middle)[0], form.half, tuple(map(tuple, edges.tolist())))
     lower, upper = form.bounds()
     if len(lower) == 2:
         (x0, y0), (x1, y1) = lower, upper

@@ -363,7 +363,8 @@ class GroupForce:
                 pull = self.gravity[c].evaluate(x, X, group.run)
                 a[c] = (a[c] + pull) * left - pull
                 for b in ti.static(range(d)):
-                    slope[c, b] = left * (slope[c, b] - rate * C[c, b])
+                    # A measurement, without a kick, is of da/dx alone.
+                    slope[c, b] = left * (slope[c, b] - ti.select(kick > 0.0, rate * C[c, b], 0.0))
         return a, slope
 
 
