@@ -6,7 +6,8 @@ from solver_state import scene_of
 
 from mpmcli.check.finding import Finding
 from mpmcli.check.scene_check import SceneCheck, check_scene
-from mpmcli.scene import LoadedScene
+from mpmcli.scene import LoadedScene, Scene
+from mpmcli.scene.shapes import Form
 
 FLUID = {"law": "fluid", "density": 1000.0, "bulk_modulus": 1e6}
 SOLID = {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 1e6}
@@ -52,3 +53,8 @@ def check(*arguments: Any, **keywords: Any) -> SceneCheck:
 def found(rule: str, *arguments: Any, **keywords: Any) -> list[Finding]:
     """Return what one rule finds in such a scene."""
     return [finding for finding in check(*arguments, **keywords).findings if finding.rule == rule]
+
+
+def forms_of(scene: Scene) -> list[Form]:
+    """Return the shapes of the bodies of a scene."""
+    return [body.shape.form for body in scene.bodies]

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from check_scenes import FLUID, box, loaded
+from check_scenes import FLUID, box, forms_of, loaded
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -102,7 +102,7 @@ def test_only_close_bodies_are_paired() -> None:
 
     # The boxes of "b" and "c" overlap, and their outlines are 0.041 apart.
     scene = loaded([disc("a", 0.2, 0.2), disc("b", 0.41, 0.2), disc("c", 0.56, 0.39)]).scene
-    pairs = {(i, j): distance for i, j, distance in close_pairs(scene, 0.02)}
+    pairs = {(i, j): distance for i, j, distance in close_pairs(scene, forms_of(scene), 0.02)}
     assert pairs == {(0, 1): pytest.approx(0.01)}
 
 

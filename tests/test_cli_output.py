@@ -52,9 +52,23 @@ def test_json_is_all_there_is_on_stdout(results):
     lines = outcome.stderr.splitlines()
     assert lines[0] == summary["notes"][0]
     assert lines[1].startswith("256 particles on ")
-    assert "steps of about" in lines[2] and "by a table of measured kinds" in lines[2]
+    assert "steps of about" in lines[2]
+    assert "by a table of measured kinds" in lines[2] or "its kernels are stored" in lines[2]
     # A slow machine has time for lines of progress.
     assert all("/5 frames: t = " in line for line in lines[3:])
+
+
+def test_a_run_ends_with_the_verdict_of_its_check(results, run):
+    """The same findings as those of `mpmcli check`; warnings are lines, notes are left out."""
+    summary = json.loads(results.packed.stdout)
+    checked = json.loads(run("check", "packed", "--json").stdout)
+    assert summary["check"] == checked | {"path": summary["check"]["path"]}
+    crushed = "--force", "--set", "bodies[0].velocity=[0.0, -20.0]", "--set", "bodies[0].material.bulk_modulus=1e5"
+    outcome = run("simulate", "scene.toml", "-o", "fast", *crushed)
+    verdict = run("check", "fast").stdout.splitlines()
+    said = outcome.stdout[outcome.stdout.index("\ncheck: ") :].splitlines()[1:]
+    assert outcome.status == 0 and said[0] == "check: suspect" and ": suspect, " in verdict[0]
+    assert said[1:] and said[1:] == [line for line in verdict if line.startswith("warning: ")]
 
 
 def test_quiet_says_nothing(results):

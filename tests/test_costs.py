@@ -82,4 +82,6 @@ def test_a_forecast_is_the_cost_of_its_steps() -> None:
     cost = cost_of(scene, cheapest(scene, forecast.steps, 1))
     assert forecast.step_seconds == cost.step and not forecast.measured
     assert forecast.seconds == pytest.approx(cost.seconds(forecast.steps, 1), abs=2.0)
-    assert f"{forecast.steps:,} steps of about" in check.outlook() and "by the wave limit of" in check.outlook()
+    said, stored = check.outlook(stored=False), check.outlook(stored=True)
+    assert f"{forecast.steps:,} steps of about" in said and "by the wave limit of" in said
+    assert "s of it to compile" in said and "its kernels are stored" in stored

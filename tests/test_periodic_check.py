@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from check_scenes import forms_of
 from command import CONFIGS, run_here
 from scenes import volume_errors
 from solver_state import scene_of
@@ -41,9 +42,9 @@ def test_a_body_meets_another_across_the_face() -> None:
     for found in arrivals(two_balls()):
         assert found.time == pytest.approx(0.35) and found.speed == pytest.approx(1.0)
     assert arrivals(two_balls(speed=0.0))[0].time == np.inf
-    assert [pair[:2] for pair in close_pairs(two_balls(), 0.41)] == [(0, 1)]
-    assert [pair[2] for pair in close_pairs(two_balls(), 0.41)] == [pytest.approx(0.4)]
-    assert list(close_pairs(two_balls(), 0.39)) == []
+    assert [pair[:2] for pair in close_pairs(two_balls(), forms_of(two_balls()), 0.41)] == [(0, 1)]
+    assert [pair[2] for pair in close_pairs(two_balls(), forms_of(two_balls()), 0.41)] == [pytest.approx(0.4)]
+    assert list(close_pairs(two_balls(), forms_of(two_balls()), 0.39)) == []
 
 
 def test_nothing_falls_onto_a_periodic_face() -> None:

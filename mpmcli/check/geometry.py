@@ -1,7 +1,7 @@
 """Thickness of a shape, which the grid has to resolve, and the distance between two shapes."""
 
 import math
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from itertools import product
 
 import numpy as np
@@ -84,14 +84,14 @@ def _inradius(form: Form) -> float:
     return best
 
 
-def close_pairs(scene: Scene, reach: float) -> Iterator[tuple[int, int, float]]:
-    """Yield (i, j, distance in m) of bodies up to `reach` apart; across a periodic face that of bounding boxes."""
-    bounds = [body.shape.form.bounds() for body in scene.bodies]
+def close_pairs(scene: Scene, forms: Sequence[Form], reach: float) -> Iterator[tuple[int, int, float]]:
+    """Yield (i, j, distance in m) of forms up to `reach` apart; across a periodic face that of bounding boxes."""
+    bounds = [form.bounds() for form in forms]
     lowers, uppers = np.array([b[0] for b in bounds]), np.array([b[1] for b in bounds])
     for j in range(1, len(bounds)):
         apart = np.maximum(lowers[:j] - uppers[j], lowers[j] - uppers[:j])
         for i in np.flatnonzero(np.all(apart <= reach, axis=1)):
-            distance = distance_between(scene.bodies[i].shape.form, scene.bodies[j].shape.form)
+            distance = distance_between(forms[i], forms[j])
             if distance <= reach:
                 yield int(i), j, distance
         for shift in image_shifts(scene)[1:]:
@@ -107,7 +107,7 @@ def image_shifts(scene: Scene) -> np.ndarray:
 
 
 def distance_between(first: Form, second: Form) -> float:
-    """Return the distance of two shapes that do not overlap, m; iterative for two cylinders, or box and cylinder."""
+    """Return the distance of two shapes, m, 0 if they overlap; iterative for two cylinders, or box and cylinder."""
     if any(isinstance(form, Composite | Mesh | Points | TurnedBox) for form in (first, second)):
         return _distance_by_search(first, second)
     pairs = ((first, second), (second, first))
@@ -119,6 +119,8 @@ def distance_between(first: Form, second: Form) -> float:
         return float(np.linalg.norm(np.maximum(0.0, np.maximum(c - b, a - d))))
     if isinstance(first, Polygon) or isinstance(second, Polygon):
         v, w = _outline(first), _outline(second)
+        if first.contains(w[:1])[0] or second.contains(v[:1])[0] or _cross(v, w):
+            return 0.0
         rounding = sum(form.radius for form in (first, second) if isinstance(form, Capsule))
         return max(0.0, float(min(edge_distances(v, w).min(), edge_distances(w, v).min())) - rounding)
     for capsule, other in pairs:
@@ -141,6 +143,18 @@ def _outline(form: Form) -> np.ndarray:
         return np.array([form.start, form.end])
     (x0, y0), (x1, y1) = form.bounds()
     return np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
+
+
+def _cross(v: np.ndarray, w: np.ndarray) -> bool:
+    """Return whether two outlines cross, (k, 2) each: the ends of an edge lie on both sides of one of the other."""
+
+    def sides(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """Return for edge i of outline a and corner j of b whether the corner is to the left of the edge."""
+        (x, y), along = np.moveaxis(b[None] - a[:, None], -1, 0), np.roll(a, -1, axis=0) - a
+        return along[:, :1] * y > along[:, 1:] * x
+
+    first, second = sides(v, w), sides(w, v).T
+    return bool(((first != np.roll(first, -1, axis=1)) & (second != np.roll(second, -1, axis=0))).any())
 
 
 def _nearest_in(point: np.ndarray, form: Form) -> np.ndarray:

@@ -2,12 +2,12 @@
 
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from mpmcli.check.facts import SceneFacts
 from mpmcli.check.finding import SEVERITIES, Finding, gravest_first, merged, passes
-from mpmcli.check.forecast import Forecast, Probe, forecast_of, output_findings
+from mpmcli.check.forecast import LOAD_SECONDS, Forecast, Probe, forecast_of, output_findings
 from mpmcli.check.material_rules import material_findings
 from mpmcli.check.scene_limits import SceneLimit
 from mpmcli.check.shape_rules import drive_findings, shape_findings
@@ -65,9 +65,12 @@ class SceneCheck:
         ]
         return "\n\n".join(part for part in parts if part)
 
-    def outlook(self) -> str:
-        """Return a line for the start of a run: steps and their cause, frames, disk, time."""
+    def outlook(self, *, stored: bool) -> str:
+        """Return a line for the start of a run: steps, cause, frames, disk, time; `stored`: its kernels are."""
         forecast, limit, step = self.forecast, self.facts.binding, self.facts.taken(self.facts.step_expected)
+        if stored and forecast.seconds is not None:
+            seconds = forecast.seconds - forecast.compile_seconds + LOAD_SECONDS
+            forecast = replace(forecast, seconds=seconds, compile_seconds=0.0)
         cause = f"by the {limit.name} limit" + (f' of "{limit.body}"' if limit.body else "")
         if step < self.facts.step_expected:
             cause = "as the scene asks"
@@ -193,7 +196,9 @@ def _took_text(forecast: Forecast) -> str:
     if forecast.seconds is None:
         return ""
     compiling = f"{forecast.compile_seconds:.2g} s of it to compile"
-    if not forecast.measured:
+    if not forecast.compile_seconds:
+        compiling = "its kernels are stored"
+    elif not forecast.measured:
         compiling += ", unless a run of this kind did; by a table of measured kinds"
     seconds = forecast.seconds
     length, unit = (1, "s") if seconds < 120 else (60, "min") if seconds < 7200 else (3600, "h")

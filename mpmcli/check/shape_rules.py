@@ -16,7 +16,7 @@ from mpmcli.check.geometry import close_pairs
 from mpmcli.check.result_state import STRETCHED, TORN
 from mpmcli.scene import Scene
 from mpmcli.scene.bounds import body_points
-from mpmcli.scene.colliders import Motion
+from mpmcli.scene.colliders import Motion, Plane
 from mpmcli.scene.domain import PERIODIC
 from mpmcli.scene.primitives import grid_points
 from mpmcli.scene.problem import quoted, several
@@ -47,6 +47,8 @@ BEGINS_INSIDE = 0.1
 UNDER = 1.0
 # Stretch beside a grip over that of the body between two grips, as measured for a bar pulled to twice its length.
 UNEVEN = 1.11
+# Cells that liquids and grains stand off colliders where they arrive, and across an opening that sand passes freely.
+STANDOFF, OPENING = (0.6, 1.5), 15.0
 # Points along the longest axis of the lattice that measures room, and number of instants of the run.
 POINTS, INSTANTS = {2: 96, 3: 32}, 33
 
@@ -76,7 +78,7 @@ def _gaps(facts: SceneFacts) -> Iterator[Finding]:
     h = facts.scene.domain.spacing
     bodies = facts.scene.bodies
     reach = REACH[facts.scene.solver.kernel]
-    for i, j, distance in close_pairs(facts.scene, reach * h):
+    for i, j, distance in close_pairs(facts.scene, [body.shape.form for body in bodies], reach * h):
         cells = distance / h
         first, second = bodies[i], bodies[j]
         if cells <= TOUCHING or cells >= reach * (1 - 1e-6) or facts.scene.friction_between(first, second) is not None:
@@ -241,11 +243,11 @@ def _stretch_to_come(facts: SceneFacts, body: BodyFacts) -> float:
 
 
 def drive_findings(facts: SceneFacts) -> Iterator[Finding]:
-    """Yield the findings on rotation and on room."""
+    """Yield the findings on rotation, on room, and on colliders."""
     for body in facts.bodies:
         yield from _rotation(facts, body)
-    yield from _room(facts)
-    yield from _rigid(facts)
+    for rule in (_room, _rigid, _standoff):
+        yield from rule(facts)
 
 
 def _rotation(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
@@ -280,11 +282,13 @@ def _rotation(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
 def _rigid(facts: SceneFacts) -> Iterator[Finding]:
     """Yield rigid bodies that are too small for the grid, and those that begin inside another body."""
     scene, h = facts.scene, facts.scene.domain.spacing
+    # A single elastic body has material on one side only.
+    between = scene.emitters or len(facts.bodies) > 1 or any(not one.body.has_surface for one in facts.bodies)
     shut = np.array(scene.domain.walls.faces(scene.dimension)) != "open"
     for body in (collider for collider in scene.colliders if collider.free):
         lower, upper = np.array(body.form.bounds())
         cells = float((upper - lower).min() / h)
-        if cells < FEWEST_CELLS:
+        if cells < FEWEST_CELLS and between:
             what = f'Rigid body "{body.name}" is {cells:.2g} cells thick: material on both sides interacts through it.'
             fix = f"Make it {FEWEST_CELLS:g} cells thick, or the spacing {h * cells / FEWEST_CELLS:.2g} m."
             yield Finding("warning", "thin", what, fix, cells, body.name)
@@ -314,6 +318,28 @@ def _rigid(facts: SceneFacts) -> Iterator[Finding]:
                 )
                 fix = f"Set it {UNDER * h:.3g} m away if it should."
                 yield Finding("note", "no-liquid-between", what, fix, -depth, body.name)
+
+
+def _standoff(facts: SceneFacts) -> Iterator[Finding]:
+    """Yield how far liquids and grains stand off colliders, and openings between colliders that hinder grains."""
+    scene, h = facts.scene, facts.scene.domain.spacing
+    solid = [one for one in scene.colliders if not one.holds]
+    loose = [one.name for one in scene.sources if not one.has_surface]
+    if not (solid and loose):
+        return
+    low, high = (cells * h for cells in STANDOFF)
+    what = f"Material that arrives at a collider or a rigid body stands {low:.2g} to {high:.2g} m off its surface."
+    fix = f"Move surfaces whose place matters by {(low + high) / 2:.2g} m, or refine the domain."
+    yield Finding("note", "stand-off", what, fix, high, loose[0])
+    grains = [one.name for one in scene.sources if one.material.law == "sand"]
+    still = [one for one in solid if not (one.free or one.motion.moves or isinstance(one.form, Plane))]
+    pairs = close_pairs(scene, [one.form for one in still], OPENING * h) if grains and len(still) > 1 else ()
+    for i, j, width in pairs:
+        if TOUCHING < width / h < OPENING * (1 - 1e-6):
+            what = f'The opening between "{still[i].name}" and "{still[j].name}" is {width / h:.3g} cells wide: '
+            what += f"fewer than {OPENING:g} let too little sand through."
+            fix = f"Make it {OPENING * h:.3g} m wide, or domain.spacing {width / OPENING:.3g} m."
+            yield Finding("note", "opening", what, fix, width / h, grains[0])
 
 
 def _room(facts: SceneFacts) -> Iterator[Finding]:

@@ -114,22 +114,28 @@ def loss_findings(facts: SceneFacts) -> Iterator[Finding]:
 
 
 def _dissipation(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
-    """Yield the loss of a wave in the run, unless plastic flow or viscosity of the body dissipates more."""
+    """Yield the loss of a wave in the run, unless plastic flow or viscosity of the body dissipates more.
+
+    An elastic body moves in its longest wave, as a beam that bends does; a liquid also in shorter ones.
+    """
     step = damped_step(facts, body, facts.taken(facts.step_at_start))
     h, end = facts.scene.domain.spacing, facts.scene.time.end
-    rate = wave_loss(body.thickness, h, step, facts.scene.solver)
+    length, extent = body.thickness, "thick"
+    if body.body.material.elastic:
+        length, extent = float(np.ptp(body.body.shape.form.bounds(), axis=0).max()), "long"
+    rate = wave_loss(length, h, step, facts.scene.solver)
     lost = -math.expm1(-rate * end)
     if lost < NOTED_LOSS or body.own_loss > rate:
         return
     what = (
         f"At a step of {step:.3g} s the transfers take {_percent(-math.expm1(-rate))} of the energy of a wave across "
-        f'body "{body.name}", {body.thickness / h:.3g} cells thick, in a second, and {_percent(lost)} in the run.'
+        f'body "{body.name}", {length / h:.3g} cells {extent}, in a second, and {_percent(lost)} in the run.'
     )
     # A wave loses an eighth: a sixteenth in each of twice as many steps.
     finer = -math.expm1(-rate * end / 8)
     fix = f"Half the spacing lowers that to {_percent(finer)} in the run"
     if finer > ALL:
-        fix = "Slower motions of the whole body lose less; where waves across it matter, refine the domain"
+        fix = "Where waves across it matter, refine the domain"
     if getattr(body.body.material, "poissons_ratio", 0.0) > LOCKING:
         fix += f", and longer steps with poissons_ratio = {LOCKING:g} or less lower it as well"
     yield Finding("note", "dissipation", what, f"{fix}.", rate, body.name)

@@ -80,12 +80,11 @@ def sweep_command(
     with ProgressBar(loaded.count, "trajectories", quiet=quiet) as bar, interrupts_wait():
 
         def show(state: SweepState) -> None:
-            left = (state.expected - state.done) / state.per_hour * 3600
-            bar.show(
-                state.done,
-                f"{state.done - state.accepted} left out, {state.per_hour:,.0f} per hour",
-                f", {duration_text(left)} left",
-            )
+            text, more = f"{state.done - state.accepted} left out", ""
+            if state.steady:
+                text += f", {state.per_hour:,.0f} per hour"
+                more = f", {duration_text((state.expected - state.done) / state.per_hour * 3600)} left"
+            bar.show(state.done, text, more)
 
         state = run_sweep(loaded, settings, show, lambda: interrupt_came() or time.monotonic() > end)
     if interrupt_came() and not state.done and not settings.resume:

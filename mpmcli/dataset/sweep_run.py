@@ -103,9 +103,14 @@ class SweepState:
         return self.verdicts.total()
 
     @property
+    def steady(self) -> bool:
+        """Whether `per_hour` is without the compilation of kernels."""
+        return self.settled is not None and self.done > self.settled[0]
+
+    @property
     def per_hour(self) -> float:
         """Trajectories per hour of this command, counted since `settled` if set."""
-        done, seconds = self.settled if self.settled is not None and self.done > self.settled[0] else (self.kept, 0.0)
+        done, seconds = self.settled if self.steady else (self.kept, 0.0)
         return 3600 * (self.done - done) / (self.seconds - seconds) if self.seconds > seconds else 0.0
 
     def count(self, row: Row) -> None:

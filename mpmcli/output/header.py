@@ -71,6 +71,7 @@ class _Output(_Facts):
 class _Body(_Facts):
     material: dict[str, Any] = {}
     shape: dict[str, Any] = {}
+    deformation: Any = None
     particles_per_cell: float | None = None
 
     def volume(self, d: int) -> float | None:

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 
 from mpmcli.check.finding import Finding, merged, passes
+from mpmcli.check.result_check import check_result
 from mpmcli.check.scene_check import check_scene
 from mpmcli.errors import DiskFullError, InputError, MpmcliError, RunError
 from mpmcli.frames.ledger import LedgerRow
@@ -121,7 +122,9 @@ def _store_run(
     summary = new_summary(context)
     summary.particles = run.particle_count
     if earlier is None:
-        summary.outlook, summary.compiling = context.check.outlook(), context.check.forecast.compile_seconds
+        stored = context.backend.on_cpu and run.batch.launch_cpu.is_there()
+        summary.outlook = context.check.outlook(stored=stored)
+        summary.compiling = None if stored else context.check.forecast.compile_seconds
     on_start(summary)
     record = new_record(context, summary)
     record.write()
@@ -164,6 +167,7 @@ def _store_run(
         return summary
     record.timings = summary.timings
     record.close(summary.status, summary.message, **failure)
+    _judge(summary, halt)
     return summary
 
 
@@ -195,7 +199,15 @@ def _complete(
     clock.stop()
     record.timings = summary.timings
     record.close(summary.status, summary.message)
+    _judge(summary, halt)
     return summary
+
+
+def _judge(summary: RunSummary, halt: StopCondition) -> None:
+    """Check a finished result as `mpmcli check` does, unless an interrupt or --max-time comes first."""
+    if summary.status == "finished":
+        with suppress(KeyboardInterrupt):
+            summary.check = check_result(summary.directory, halt.packing)
 
 
 def _compute(

@@ -4,6 +4,8 @@ import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from mpmcli.check.finding import merged
+from mpmcli.check.result_check import ResultCheck
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.solver.machine.plan import Plan
 
@@ -25,6 +27,7 @@ class RunSummary:
             included), solve_s (all further steps), watch_s (of these, measuring the state for the limits), output_s
             (frames and packing), wall_s.
         first, last: ledger rows of the first and the last frame.
+        check: that of the files of a finished run, None if there is none.
     """
 
     directory: Path
@@ -45,6 +48,7 @@ class RunSummary:
     timings: dict[str, float] = field(default_factory=dict)
     first: LedgerRow | None = None
     last: LedgerRow | None = None
+    check: ResultCheck | None = None
 
     @property
     def rate(self) -> float:
@@ -69,6 +73,7 @@ class RunSummary:
             if self.first is None or self.last is None
             else {"first": self.first.energy, "last": self.last.energy},
             "notes": list(self.notes),
+            "check": None if self.check is None else self.check.as_dict(),
         }
 
     def text(self) -> str:
@@ -92,6 +97,9 @@ class RunSummary:
             lines.append(f"blocked: {self.last.blocked} particles of emitters found their place occupied")
         if self.path is not None:
             lines.append(f"result: {self.path}")
+        if self.check is not None:
+            told = [one.line for one in merged(self.check.findings) if one.severity != "note"]
+            lines += [f"check: {self.check.verdict}", *told]
         return "\n".join(lines)
 
 

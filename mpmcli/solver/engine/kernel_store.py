@@ -49,6 +49,8 @@ PROSE = re.compile(rb'^ *""".*?"""\n|^ *#[^\n]*\n', re.MULTILINE | re.DOTALL)
 CLOCKS = 2.0
 # Upper bound of the bytes of a file of a stub, and lower bound of those of a kernel.
 STUB_BYTES = 2**14
+# Suffix of a file that names the replaced file of a stub; its own name is the key of the kernel.
+NOTE = ".stub"
 # Value that the stub stores in frame_stats[0, 0, 0], which is otherwise never negative.
 MARK = -(2**30)
 # Environment variable; "off" disables the store, for work on modules while they run.
@@ -68,6 +70,17 @@ class StoredLaunch:
         self._launch, self._kind, self._backend = launch, kind, backend
         self._kernel: Callable[..., None] | None = None
         self.stored = False
+
+    def is_there(self) -> bool:
+        """Return whether the kernel is stored, without launching it."""
+        if not self._may_store():
+            return False
+        key = kernel_key(self._kind, self._backend, self._launch.device.runs, _sources())
+        folder = Path(ti.lang.impl.current_cfg().offline_cache_file_path)
+        try:
+            return (folder / (folder / f"{key}{NOTE}").read_text(encoding="utf-8")).stat().st_size > STUB_BYTES
+        except OSError:
+            return False
 
     def __call__(
         self, numbers: np.ndarray, counts: np.ndarray, frame_buffer: np.ndarray, frame_stats: np.ndarray
@@ -222,6 +235,7 @@ def _link(key: str, name: str, folder: Path) -> None:
             kernels = {content for content in recent if name.encode() in content}
             if len(kernels) == 1 and _is_sound(*kernels):
                 _write(stub.path, *kernels)
+                _write(folder / f"{key}{NOTE}", stub.path.name.encode())
 
 
 def _remove_oldest(folder: Path) -> None:
