@@ -8,6 +8,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+import pyvista
 from command import run_here
 from scipy.integrate import solve_ivp
 from scipy.special import ellipk
@@ -131,16 +132,19 @@ def test_what_they_are_not_available_with_is_refused(tables: dict, reason: str) 
 
 
 def test_check_sees_what_is_thin_or_begins_inside() -> None:
-    """Of a wall, of another one; what touches is no finding."""
+    """Of a wall, of another one; what touches is no finding. One elastic body has no material on the other side."""
+    water = {"material": {"law": "fluid", "density": 1000.0, "bulk_modulus": 1e6}}
     thin = {"shape": box([0.6, 0.4], [0.7, 0.6])}
     sunk = {"shape": box([0.9, -0.02], [1.1, 0.2])}
     on_it = {"shape": box([0.9, 0.2], [1.1, 0.4])}
     crossed = {"shape": box([0.75, 0.35], [0.95, 0.55])}
-    found = check_scene(LoadedScene(scene(2, -G, thin, sunk, on_it, crossed), (), "scene.toml")).findings
-    found = [one for one in found if one.severity == "warning" and '"bar' in one.what]
-    said = [(one.rule, one.what.split('"')[1], round(one.value, 2)) for one in found]
-    expected = [("thin", "bar 0", 2.0), ("overlap", "bar 1", 0.4), ("overlap", "bar 2", 1.0), ("overlap", "bar 3", 1.0)]
-    assert said == expected
+    expected = [("overlap", "bar 1", 0.4), ("overlap", "bar 2", 1.0), ("overlap", "bar 3", 1.0)]
+    for jelly, thinness in (({}, []), (water, [("thin", "bar 0", 2.0)])):
+        asked = scene(2, -G, thin, sunk, on_it, crossed, jelly=jelly)
+        found = check_scene(LoadedScene(asked, (), "scene.toml")).findings
+        found = [one for one in found if one.severity == "warning" and '"bar' in one.what]
+        said = [(one.rule, one.what.split('"')[1], round(one.value, 2)) for one in found]
+        assert said == thinness + expected
     huge = check_scene(LoadedScene(scene(2, -G, {"shape": box([-0.3, 0.7], [1.5, 0.9])}), (), "scene.toml")).findings
     (what,) = (one.what for one in huge if one.rule == "too-large" and one.severity == "error")
     assert "1.5 times as long as the domain" in what
@@ -525,6 +529,38 @@ def test_jelly_stays_above_a_light_plate(backend_of: Callable) -> None:
     frames = list(build_run(scene(2, -G, plate, jelly=jelly, end=1.0), backend_of("f64", 1)).frames())
     assert frames[-1][0].position[:, 1].min() > 0.15
     assert np.abs(frames[-1][1].rigid_pose[0][1] - 0.075) < 1e-3
+
+
+@pytest.mark.parametrize("grid", ["dense", pytest.param("sparse", marks=pytest.mark.slow)])
+def test_bodies_that_are_alone_move_as_beside_material(backend_of: Callable, grid: str) -> None:
+    """A ball that bounces and a box that tips, with a block in a corner and without any material."""
+    ball = {"shape": {"ball": {"center": [0.9, 0.4], "radius": 0.1}}, "restitution": 0.6}
+    tipping = {"shape": box([0.5, 0.0], [0.6, 0.3]), "velocity": [0.9, 0.0], "angular_velocity": -3.0, "friction": 0.5}
+    asked = scene(2, -G, ball, tipping, jelly=CORNER, time={"end": 0.5, "frames": 20, "step": 5e-4})
+    alone = asked.model_copy(update={"bodies": (), "solver": asked.solver.model_copy(update={"grid": grid})})
+    (poses, rates), found = moved(asked, backend_of("f64", 1)), moved(alone, backend_of("f64", 1))
+    assert np.abs(poses[-1] - poses[0]).max(axis=1).min() > 0.1
+    assert found[0] == pytest.approx(poses, abs=1e-9) and found[1] == pytest.approx(rates, abs=1e-8)
+
+
+def test_a_scene_of_rigid_bodies_alone_is_a_result(tmp_path: Path) -> None:
+    """A ball that falls for 0.2 s: frames without particles, a stable run that goes on, and what VTK reads."""
+    ball = '[[colliders]]\nname = "ball"\ndensity = 500.0\nshape = { ball = { center = [0.5, 0.7], radius = 0.1 } }\n'
+    domain = "[domain]\nsize = [1.0, 1.0]\nspacing = 0.02\ngravity = [0.0, -9.81]\n[time]\nend = 0.2\nframes = 10\n"
+    (tmp_path / "ball.toml").write_text(domain + ball, encoding="utf-8")
+    (tmp_path / "wall.toml").write_text(domain + ball.replace("density = 500.0\n", ""), encoding="utf-8")
+    run = ["simulate", tmp_path / "ball.toml", "-o", tmp_path / "run"]
+    done = run_here(*run, "--json")
+    assert done.status == 0 and json.loads(done.stdout)["check"]["verdict"] == "stable"
+    done = run_here(*run, "--resume", "--set", "time.end=0.3", "--set", "time.frames=15", "-q")
+    assert (done.status, done.stderr) == (0, "")
+    result = open_result(tmp_path / "run")
+    height = [row.rigid_pose[0][1] for row in result.ledger]
+    assert height == pytest.approx(0.7 - G * result.times**2 / 2, abs=G * 0.01**2)
+    assert [len(frame.position) for frame in result.frames()] == [0] * 16
+    assert pyvista.read(tmp_path / "run" / "particles.vtkhdf").n_points == 0
+    done = run_here("simulate", tmp_path / "wall.toml", "-o", tmp_path / "none")
+    assert done.status == 2 and "rigid bodies (colliders with a density)" in done.stderr
 
 
 def test_a_result_has_the_body_where_it_was(tmp_path: Path) -> None:

@@ -88,7 +88,7 @@ def test_missing_tables_and_no_bodies():
         "scene.toml: time: missing key: simulated time, frames and time step",
     ]
     head = GOOD[: GOOD.index("[[bodies]]")]
-    none = "bodies: needs at least one entry, or emitters that bring the material"
+    none = "bodies: needs at least one entry, or emitters or rigid bodies (colliders with a density)"
     assert refusal("bodies = []\n" + head) == [f"scene.toml:1: {none}"] and refusal(head) == [f"scene.toml: {none}"]
 
 

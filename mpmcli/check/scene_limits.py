@@ -154,8 +154,9 @@ def _motion_limits(scene: Scene, bounds: SceneBounds, release: float) -> list[Sc
     """Return the limits set by speeds, velocity gradients and colliders, at the start and reachable in the scene."""
     h = scene.domain.spacing
     cell = f"a cell is {h:.4g} m wide"
-    fastest = max(scene.sources, key=highest_speed)
-    initial, reached = highest_speed(fastest), bounds.speed
+    starting = {source.name: highest_speed(source) for source in scene.sources}
+    fastest = max(starting, key=lambda name: starting[name], default="")
+    initial, reached = starting.get(fastest, 0.0), bounds.speed
     jets = JET * math.sqrt(max(reached**2 - release**2, 0.0)) + SPRAY * release
     falls = f"fall and initial speeds make {reached:.4g} m/s, jets {JET:g} times that"
     if release > 0:
@@ -167,7 +168,7 @@ def _motion_limits(scene: Scene, bounds: SceneBounds, release: float) -> list[Sc
     limits = [
         _motion_limit(
             speed_limit(h, initial, bounds.gravity),
-            ("speed", fastest.name if initial > 0 else "", "rest", f"starting at {initial:.3g} m/s"),
+            ("speed", fastest if initial > 0 else "", "rest", f"starting at {initial:.3g} m/s"),
             f"the fastest particle starts at {initial:.4g} m/s, and {cell}",
         ),
         _motion_limit(
@@ -186,7 +187,8 @@ def _motion_limits(scene: Scene, bounds: SceneBounds, release: float) -> list[Sc
             f"an impact at {reached:.4g} m/s stops within a cell, a velocity gradient of {impact:.4g} /s",
         ),
     ]
-    limits = [limit for limit in limits if math.isfinite(limit.value)]
+    # Rigid bodies at rest, without material, have no limit.
+    limits = [limit for limit in limits if math.isfinite(limit.value)] or ([] if scene.sources else limits[:1])
     speeds = {collider.name: collider.fastest(scene.domain, scene.time.end) for collider in scene.colliders}
     moving = max(speeds, key=lambda name: speeds[name], default="")
     speed = speeds.get(moving, 0.0)

@@ -252,9 +252,11 @@ def scene_bounds(scene: Scene, sources: Sequence[Body | Emitter] | None = None) 
         )
     g = pull.largest
     pushed_by = [collider.fastest(scene.domain, scene.time.end) for collider in scene.colliders]
-    initial = max(scene.domain.wall_speed, *pushed_by, *(highest_speed(body) for body in sources))
+    initial = max([scene.domain.wall_speed, *pushed_by, *(highest_speed(body) for body in sources)])
     closed = ~np.array(scene.domain.periodic)
-    corners = np.concatenate([_corners(*body.shape.form.bounds()) for body in sources])
+    # Without material the rigid bodies are what falls.
+    forms = [body.shape.form for body in sources] or [one.form for one in scene.colliders if one.free]
+    corners = np.concatenate([_corners(*form.bounds()) for form in forms])
     if any((gravity * closed).any() for gravity in gravities):
         pulling = [gravity * closed for gravity in gravities if (gravity * closed).any()]
         height = max(0.0, *(float(np.max(_falls(scene, corners, gravity))) for gravity in pulling))
@@ -272,7 +274,7 @@ def scene_bounds(scene: Scene, sources: Sequence[Body | Emitter] | None = None) 
         gravity=g + push.largest,
         speed=float(np.sqrt(initial * initial + fallen + pushed)) + sum(abs(one.strength) for one in scene.impulses),
         height=height,
-        density=max(body.material.density for body in sources),
+        density=max((body.material.density for body in sources), default=0.0),
     )
 
 

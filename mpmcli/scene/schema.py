@@ -340,8 +340,8 @@ class Scene(Table):
 
     @model_validator(mode="after")
     def _has_material(self) -> "Scene":
-        if not self.sources:
-            raise flaw("needs at least one entry, or emitters that bring the material", "bodies")
+        if not (self.sources or any(collider.free for collider in self.colliders)):
+            raise flaw("needs at least one entry, or emitters or rigid bodies (colliders with a density)", "bodies")
         return self
 
     @property
@@ -378,6 +378,11 @@ class Scene(Table):
     def sources(self) -> "tuple[Body | Emitter, ...]":
         """All sources of particles, in the order of their labels: the bodies, then the emitters."""
         return (*self.bodies, *self.emitters)
+
+    @property
+    def laws(self) -> tuple[str, ...]:
+        """The names of the laws of its materials, sorted; rigid bodies alone have one that compiles fast."""
+        return tuple(sorted({source.material.law for source in self.sources})) or ("fixed_corotated",)
 
     @property
     def pushes(self) -> tuple[Force, ...]:

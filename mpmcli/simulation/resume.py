@@ -145,7 +145,7 @@ def take_over(directory: Path, resumption: Resumption) -> None:
 def file_digests(loaded: LoadedScene) -> dict[str, str]:
     """Return the SHA-256 of each file that a scene reads, by its name in the scene, and of each plugin it needs."""
     scene, found = loaded.scene, {}
-    for law in sorted({body.material.law for body in scene.sources}):
+    for law in scene.laws:
         if plugin := plugin_file(law):
             found[f"the plugin of the law {law}"] = path_digest(plugin)
     for entry in (*scene.sources, *scene.colliders):

@@ -6,13 +6,12 @@ from dataclasses import dataclass, field, replace
 from mpmcli.boundaries.colliders import ColliderKind
 from mpmcli.boundaries.walls import moving_faces, rough_faces
 from mpmcli.materials.law import Law
-from mpmcli.materials.registry import laws
 from mpmcli.scene import BodyParticles, Scene
 from mpmcli.scene.schema import SolverSettings
 from mpmcli.solver.contact.layers import Layers
 from mpmcli.solver.drive.forces import Drives
 from mpmcli.solver.grid.sparse_grid import wants_sparse
-from mpmcli.solver.machine.plan import in_steps, members_of, padded_cells, padded_colliders, power_of_two
+from mpmcli.solver.machine.plan import in_steps, law_objects, members_of, padded_cells, padded_colliders, power_of_two
 from mpmcli.solver.particles.inflow import Inflow
 from mpmcli.solver.transfer.kept_motion import keeps_motion
 from mpmcli.solver.transfer.redistribution import fine_nodes
@@ -66,12 +65,9 @@ class CompiledKind:
     @staticmethod
     def of(scene: Scene, particles: Sequence[BodyParticles]) -> "CompiledKind":
         """Return the kind of a scene with these particles, one entry per source."""
-        names = sorted({body.material.law for body in scene.sources})
+        names = scene.laws
         places = [members_of(scene, name) for name in names]
-        members = tuple(
-            laws()[name]([scene.sources[i].material for i in own], scene.dimension)
-            for name, own in zip(names, places, strict=True)
-        )
+        members = law_objects(scene)
         return CompiledKind(
             scene.dimension,
             scene.solver.precision,
@@ -81,8 +77,9 @@ class CompiledKind:
             moving_faces(scene),
             tuple((law.name, law.terms) for law in members),
             tuple(scene.domain.cells),
-            tuple(sum(len(particles[i].position) for i in own) for own in places),
-            tuple(len(own) for own in places),
+            # Rigid bodies alone have none, but fields have an entry.
+            tuple(max(1, sum(len(particles[i].position) for i in own)) for own in places),
+            tuple(max(1, len(own)) for own in places),
             needs_filling(scene, members, Layers.of(scene).count),
             fine_nodes(scene, members),
             keeps_motion(scene, members),

@@ -54,7 +54,7 @@ class LaunchBudget:
     """The number of `steps` of the next launch, such that the host regains control within some tenths of a second."""
 
     def __init__(self, particles: int) -> None:
-        self.steps = max(1, FIRST // particles)
+        self.steps = max(1, FIRST // max(1, particles))
 
     def took(self, steps: int, seconds: float) -> None:
         """Update the budget from the steps and the wall time, s, of the last launch."""
@@ -110,7 +110,8 @@ class Run:
         self._recorder = FrameRecorder(batch, slot, self.particle_count, scene.time.frames)
         self._place()
         if batch.device.grid.sparse:
-            batch.occupy(first_nodes_of(np.concatenate([body.position for body in self._particles]), scene))
+            places = [np.empty((0, scene.dimension)), *(body.position for body in self._particles)]
+            batch.occupy(first_nodes_of(np.concatenate(places), scene))
         # The builder copies the data that it needs of the initial particles, which are now on the device.
         _ = self._builder
         self._particles = []

@@ -12,6 +12,7 @@ from mpmcli.solver.contact.layers import Layers
 from mpmcli.solver.contact.surfaces import rest_surface
 from mpmcli.solver.engine.batch import Batch
 from mpmcli.solver.machine.plan import members_of
+from mpmcli.solver.particles.arrays import CONSTANTS
 from mpmcli.solver.particles.state_bounds import floor_of
 
 # Particles per copy to the device.
@@ -20,7 +21,8 @@ PART = 2**15
 
 def table_of(law: Law, particles: Sequence[BodyParticles]) -> np.ndarray:
     """Return the rows of `ParticleArrays.table` for the members of a law, (bodies, columns)."""
-    return np.array([(b.mass, b.volume, *law.constants(p)) for b, p in zip(particles, law.members, strict=True)])
+    rows = [(b.mass, b.volume, *law.constants(p)) for b, p in zip(particles, law.members, strict=True)]
+    return np.array(rows) if rows else np.empty((0, CONSTANTS))
 
 
 def initial_states(
@@ -78,7 +80,7 @@ class RunGroup:
         count: number of particles n.
         row: first row in `table`.
         rows: host copy of the rows of `table`.
-        floor: lower bounds of the maxima of a measurement if particles come and go, else None.
+        floor: lower bounds of the maxima of a measurement if there may be no particle, else None.
         total, dimension, real, internal: attributes of the arrays.
     """
 
@@ -141,7 +143,8 @@ class RunGroup:
         for first, found, row in states:
             self.arrays.write(self.first + first, found, self.row + row)
         numbers = [[layers.numbers[body] for body in self.bodies]] if self.arrays.layers > 1 else []
-        self.arrays.rows.write(self.row, self.rows, *numbers)
+        if self.bodies:
+            self.arrays.rows.write(self.row, self.rows, *numbers)
 
 
 def groups_of(batch: Batch, slot: int, scene: Scene, particles: Sequence[BodyParticles]) -> list[RunGroup]:

@@ -296,6 +296,8 @@ class StepSize:
 # if a stiffness may have grown by more than UNWATCHED_SHARE of the margin of time.safety; a decrease is noticed late.
 # The share is near 1 because every step reads back the rate of deformation.
 MOST_UNWATCHED_STEPS, MOST_PUSHED_STEPS, UNWATCHED_SHARE = 256, 64, 0.95
+# Largest step of rigid bodies alone, as a share of the bound for a body that begins to fall.
+FALL = 0.2
 
 
 class StepControl:
@@ -312,6 +314,9 @@ class StepControl:
         self._groups, self._state = groups, state
         self._names = tuple(body.name for body in scene.sources)
         self._spacing = scene.domain.spacing
+        # Without material; the energy in the ledger is then within 1 % of that turned over.
+        pull = math.hypot(*scene.domain.gravity_at(0.0))
+        self._none = Limit(FALL * speed_limit(self._spacing, 0.0, pull), "speed", "")
         self._inertia = step_inertia(scene.solver)
         self._measure = measurements
         state.longest = MOST_PUSHED_STEPS if scene.pushes else MOST_UNWATCHED_STEPS
@@ -377,7 +382,7 @@ class StepControl:
     @property
     def stiffest(self) -> Limit:
         """The smallest bound by stiffness."""
-        return min(limit for limits in self._limits for limit in limits)
+        return min((limit for limits in self._limits for limit in limits), default=self._none)
 
     def due(self) -> list[int]:
         """Return the groups to measure after a series of steps by a kernel.

@@ -305,7 +305,7 @@ class FrameBuilder:
         self._initial = None
         if "initial_position" in scene.output.fields:
             initial = [b.position if b.initial is None else b.initial for b in particles]
-            self._initial = np.concatenate(initial).astype(self._position_type)
+            self._initial = np.concatenate([np.empty((0, scene.dimension)), *initial]).astype(self._position_type)
 
     def build(
         self, moments: Sequence[Moment], arrays: FrameArrays, sums: Sequence[Sums]
@@ -405,8 +405,8 @@ class _Totals:
         if status is not None:
             self._add_active(x, ratios, same, body, status)
             return
-        self._low = np.minimum(self._low, ratios.min(axis=1))
-        self._high = np.maximum(self._high, ratios.max(axis=1))
+        self._low = np.minimum(self._low, ratios.min(axis=1, initial=np.inf))
+        self._high = np.maximum(self._high, ratios.max(axis=1, initial=-np.inf))
         for own, filled in self._filled:
             filled.add(x[own], ratios[own] * same.volume, same.flows)
 

@@ -22,8 +22,8 @@ def stress_entries(dimension: int) -> tuple[tuple[int, int], ...]:
 
 
 def parts_of(count: int) -> Iterator[slice]:
-    """Yield slices of the rows of `count` particles, PART at a time."""
-    for first in range(0, count, PART):
+    """Yield slices of the rows of `count` particles, PART at a time; an empty one without particles."""
+    for first in range(0, max(1, count), PART):
         yield slice(first, min(first + PART, count))
 
 

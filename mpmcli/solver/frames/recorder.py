@@ -50,7 +50,7 @@ class FrameRecorder:
         """Start recording frames with the next launch."""
         self._columns = columns
         size = self._particles * columns.count * self._batch.frame_buffer.itemsize
-        self._capacity = min(max(1, ROOM // size), MOST_FRAMES, self._frames)
+        self._capacity = min(max(1, ROOM // max(1, size)), MOST_FRAMES, self._frames)
         self._state.records = 1
 
     def reserve(self) -> None:
@@ -78,7 +78,7 @@ class FrameRecorder:
             moments.append(moment_of(now, self.index, taken, own))
             self.index, self.steps = self.index + 1, step
         rows = self._batch.frame_buffer[self._batch.first_row(self._slot) :][: count * self._particles]
-        arrays = FrameArrays(builder.columns, rows.reshape(count, self._particles, -1))
+        arrays = FrameArrays(builder.columns, rows.reshape(count, self._particles, builder.columns.count))
         return builder.build(moments, arrays, self._sums(count)[0])
 
     def read_now(self, arrays: FrameArrays, launch: Callable[..., None]) -> list[Sums] | None:

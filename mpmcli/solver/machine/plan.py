@@ -295,6 +295,14 @@ def members_of(scene: Scene, law: str) -> list[int]:
     return [i for i, body in enumerate(scene.sources) if body.material.law == law]
 
 
+def law_objects(scene: Scene) -> tuple[Law, ...]:
+    """Return the laws of a scene; without material one of any parameters, which no particle has."""
+    materials = [[scene.sources[i].material for i in members_of(scene, name)] for name in scene.laws]
+    if not scene.sources:
+        materials = [[laws()[name].parameters(density=1.0, youngs_modulus=1.0) for name in scene.laws]]
+    return tuple(laws()[name](own, scene.dimension) for name, own in zip(scene.laws, materials, strict=True))
+
+
 def make_plan(scene: Scene, backend: Backend) -> Plan:
     dimension = scene.dimension
     sparse = wants_sparse(scene) and backend.on_cpu
@@ -302,14 +310,12 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
     real = 8 if backend.precision == "f64" else 4
     width = node_width(dimension, on_cpu=backend.on_cpu)
     bodies = Counter(body.material.law for body in scene.sources)
-    counts = Counter[str]()
+    counts = Counter(dict.fromkeys(scene.laws, 0))
     for index, body in enumerate(scene.bodies):
         counts[body.material.law] += count_body(body, index, scene.domain.spacing)
     for emitter in scene.emitters:
         counts[emitter.material.law] += sheets_of(emitter, scene).particles
-    members = [
-        laws()[name]([scene.sources[i].material for i in members_of(scene, name)], dimension) for name in sorted(bodies)
-    ]
+    members = law_objects(scene)
     averaged = [averages_volume(scene.solver, law) for law in members]
     require_contact_possible(scene, backend)
     _require_rigid_possible(scene)
@@ -333,7 +339,7 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
                 surfaced=separate and laws()[name].elastic,
             ),
         )
-        for name, shares in zip(sorted(bodies), averaged, strict=True)
+        for name, shares in zip(scene.laws, averaged, strict=True)
     )
     # The widest field is a matrix; sources and keys are integers.
     widest = max(size for group in groups for size in group.fields.values())

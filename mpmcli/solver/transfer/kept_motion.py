@@ -24,8 +24,8 @@ NEAR = 0.8
 def keeps_motion(scene: Scene, members: Sequence[Law]) -> bool:
     """Return whether any body of a scene keeps a fraction of its motion, as estimated before the run."""
     time, h = scene.time, scene.domain.spacing
-    if scene.solver.flip:
-        return True
+    if scene.solver.flip or not scene.sources:
+        return bool(scene.solver.flip)
     of_name = {law.name: law for law in members}
     own = [own_limit(source, of_name[source.material.law], scene) for source in scene.sources]
     driven = [collider_limit(h, collider.fastest(scene.domain, time.end)) for collider in scene.colliders]
