@@ -5,6 +5,7 @@ Also its card, README.md in its directory: distributions, contents, and code tha
 
 import json
 import math
+import re
 import tomllib
 from array import array
 from collections import Counter
@@ -30,8 +31,9 @@ from mpmcli.dataset.shard import (
 )
 from mpmcli.errors import InputError, RunError
 from mpmcli.output.checksums import checksum_is_right
-from mpmcli.output.durable import write_text
+from mpmcli.output.durable import sealed
 from mpmcli.plain_text import counted, markdown_table, one_line, size_text
+from mpmcli.render.picture_file import digest_of
 
 # Largest number of trajectories named in a text.
 MOST_NAMED = 10
@@ -180,6 +182,9 @@ def _trajectory_faults(file: h5py.File, row: Row) -> list[str]:
 
 
 CARD, MONTAGE = "README.md", "montage.png"
+# Marks around the card in README.md, whose other text is its owner's; a part without its end mark is the owner's, too.
+MARKS = b"<!-- card: written by mpmcli -->", b"<!-- end of card -->"
+_MARKED = re.compile(rb"(?s)%b((?!%b).)*?%b\n?" % (MARKS[0], MARKS[0], MARKS[1]))
 # Bins of a histogram; if there are few distinct values, each is counted separately.
 BINS = 10
 MOST_COUNTED = 6
@@ -191,7 +196,7 @@ def write_card(directory: Path) -> Path:
     """Write the card of a dataset whose trajectories have all been tried, and return its path.
 
     Its bytes depend on the sweep and the trajectories alone, not on times, machines, interrupts or parts. It shows the
-    picture montage.png if the directory contains one.
+    picture montage.png if the directory contains one. Other text in the file is kept.
     """
     manifest = Manifest(directory)
     facts, rows = manifest.facts(), manifest.rows()
@@ -216,10 +221,29 @@ def write_card(directory: Path) -> Path:
         "the sweep and its base scene.",
     ]
     try:
-        write_text(directory / CARD, "\n\n".join(section for section in sections if section) + "\n")
+        _put_card(directory / CARD, "\n\n".join(section for section in sections if section).encode())
     except OSError as error:
         raise RunError(f"{directory / CARD} could not be written ({error.strerror}); the dataset is kept.") from error
     return directory / CARD
+
+
+def _put_card(path: Path, card: bytes) -> None:
+    """Put a card between its marks, or after all other text."""
+    before, marked = path.read_bytes() if path.exists() else b"", b"\n\n".join([MARKS[0], card, MARKS[1]]) + b"\n"
+    text, found = _MARKED.subn(lambda _: marked, before)
+    with sealed(path) as temporary:
+        temporary.write_bytes(text if found else b"\n".join(filter(None, [before, marked])))
+
+
+def remove_card(directory: Path) -> None:
+    """Remove the card of a dataset, and its picture if mpmcli has drawn it; README.md stays if it has other text."""
+    path = directory / CARD
+    if path.exists() and _MARKED.sub(b"", path.read_bytes()).strip():
+        _put_card(path, b"")
+    else:
+        path.unlink(missing_ok=True)
+    if digest_of(directory / MONTAGE):
+        (directory / MONTAGE).unlink()
 
 
 def first_paragraph(text: str) -> str:
