@@ -10,7 +10,7 @@ import sqlite3
 import tomllib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import astuple, dataclass, fields, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -266,7 +266,8 @@ def copy_sources(names: Iterable[str], origin: Path, directory: Path) -> None:
     for name in copied_files(names):
         if (origin / name).is_file():
             (directory / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(origin / name, directory / name)
+            with suppress(shutil.SameFileError):
+                shutil.copyfile(origin / name, directory / name)
 
 
 def standing_alone(sweep: Sweep) -> str:
