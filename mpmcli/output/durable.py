@@ -4,7 +4,7 @@ import errno
 import os
 import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -121,12 +121,15 @@ def numbered_files(folder: Path, names: re.Pattern[str]) -> list[Path]:
     return sorted(paths, key=number_of)
 
 
-def remove_numbered(folder: Path, names: re.Pattern[str]) -> None:
-    """Remove files with such names, also unfinished ones, and the folder unless it contains other files."""
+def remove_numbered(folder: Path, names: re.Pattern[str], spared: Collection[Path] = ()) -> None:
+    """Remove files with such names, also unfinished ones, and the folder unless it contains other files.
+
+    `spared` are resolved paths.
+    """
     if not folder.is_dir():
         return
     for path in folder.iterdir():
-        if names.fullmatch(path.name.removesuffix(TEMPORARY_SUFFIX)):
+        if names.fullmatch(path.name.removesuffix(TEMPORARY_SUFFIX)) and path.resolve() not in spared:
             path.unlink(missing_ok=True)
     with suppress(OSError):
         folder.rmdir()
