@@ -107,14 +107,40 @@ def test_parts_and_another_number_of_workers_make_the_same_dataset(
         merge([parts[0], parts[0], parts[1]], tmp_path / "half")
     assert not (tmp_path / "half").exists()
 
-    # What is left of a merge that was ended is not whole.
-    def ended(*_: object) -> None:
-        raise KeyboardInterrupt
 
-    monkeypatch.setattr(shutil, "copyfile", ended)
-    with pytest.raises(KeyboardInterrupt):
-        merge(parts, tmp_path / "ended")
-    assert verify(tmp_path / "ended").faults
+@pytest.mark.usefixtures("made_workers")
+def test_a_merge_that_was_killed_goes_on() -> None:
+    """At any of its syncs of a file or directory; what is left is known as not whole, and other parts cannot go on."""
+    parts = [make_dataset(f"part{i}", (i, 2)) for i in (1, 2)]
+    merge(parts, Path("whole"))
+    expected, other = contents(Path("whole")), make_dataset("other", count=6)
+    for killed in range(0, 100, 4):
+        shutil.rmtree("d", ignore_errors=True)
+        if not (child := os.fork()):
+            syncs = 0
+
+            def sync(_: int, last: int = killed) -> None:
+                nonlocal syncs
+                syncs += 1
+                if syncs > last:
+                    os._exit(9)
+
+            os.fsync = sync
+            merge(parts, Path("d"))
+            os._exit(0)
+        if os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0:
+            break
+        if (Path("d") / "manifest.sqlite").exists():
+            status = status_of(Path("d"))
+            there = len(list(Path("d/shards").glob("*.h5")))
+            assert (status.accepted == 10) == (there == 4 and len(status.rows) == 12)
+            with pytest.raises(InputError, match="holds another dataset"):
+                merge([other], Path("d"))
+        merge(parts, Path("d"))
+        assert contents(Path("d")) == expected and told(Path("d")) == told(Path("whole"))
+        with pytest.raises(InputError, match="exists and is not empty"):
+            merge(parts, Path("d"))
+    assert killed > 10
 
 
 def test_a_dataset_that_is_being_written_is_refused(tmp_path: Path) -> None:

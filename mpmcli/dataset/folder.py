@@ -26,7 +26,7 @@ from mpmcli.dataset.sweep import Sweep
 from mpmcli.errors import InputError, RunError
 from mpmcli.output.checksums import checksum_is_right, first_line, path_digest, require_format
 from mpmcli.output.directory import check_directory
-from mpmcli.output.durable import require_free_space, sealed
+from mpmcli.output.durable import TEMPORARY_SUFFIX, require_free_space, sealed
 from mpmcli.output.lock import LOCK
 from mpmcli.scene.toml_file import key_parts
 
@@ -158,6 +158,13 @@ def require_empty(directory: Path, *, locked: bool = False) -> None:
     if directory.is_dir() and any(path.name != LOCK for path in directory.iterdir()):
         raise InputError(f"{directory} exists and is not empty: give another directory with -o.")
     check_directory(directory, overwrite=False, locked=locked)
+
+
+def is_beginning(directory: Path) -> bool:
+    """Return whether a directory holds what a process leaves that is killed before its dataset has a manifest."""
+    names = [path.name for path in directory.iterdir()] if directory.is_dir() else [MANIFEST]
+    done = {name.removesuffix("-journal").removesuffix(TEMPORARY_SUFFIX) for name in names}
+    return MANIFEST not in names and done <= {SWEEP, BASE, MANIFEST, LOCK}
 
 
 class Folder:

@@ -41,17 +41,26 @@ MOST_NAMED = 10
 
 @dataclass(frozen=True)
 class Status:
-    """Counts of a dataset with `part` (i, n) of a sweep: `expected` trajectories, and `rows` of those tried."""
+    """Counts of a dataset with `part` (i, n) of a sweep: `expected` trajectories, and `rows` of those tried.
+
+    `missing` files of trajectories do not exist.
+    """
 
     path: Path
     part: tuple[int, int]
     expected: int
     rows: tuple[Row, ...]
+    missing: frozenset[str] = frozenset()
 
     @property
     def accepted(self) -> int:
         """Trajectories that the dataset includes."""
-        return sum(row.accepted for row in self.rows)
+        return sum(row.accepted for row in self.rows if row.file not in self.missing)
+
+    @property
+    def absent(self) -> list[int]:
+        """Numbers of the trajectories without their file."""
+        return [row.number for row in self.rows if row.file in self.missing]
 
     def as_dict(self) -> dict:
         """Return the counts, and the reason of each trajectory that is not included."""
@@ -63,6 +72,7 @@ class Status:
             "part": list(self.part),
             "trajectories": self.expected,
             "done": len(self.rows),
+            "missing": self.absent,
             "accepted": self.accepted,
             "retried": sum(row.retries > 0 for row in self.rows),
             "verdicts": {verdict: verdicts[verdict] for verdict in VERDICTS},
@@ -75,7 +85,8 @@ class Status:
     def lack(self) -> str:
         """Return the part of the sweep that the dataset lacks, apart from exclusions by verdict, "" if none."""
         failed, waiting = sum(row.verdict == "failed" for row in self.rows), self.expected - len(self.rows)
-        told = [f"{n} {what}" for n, what in ((waiting, "not computed"), (failed, "failed")) if n]
+        counts = ((waiting, "not computed"), (failed, "failed"), (len(self.absent), "without their file"))
+        told = [f"{n} {what}" for n, what in counts if n]
         (i, n), of = self.part, counted(self.expected, "trajectory")
         if n > 1:
             told.append(f"this is part {i} of {n} of the sweep")
@@ -88,6 +99,7 @@ class Status:
             f"{self.path}: {self.accepted} of {counted(self.expected, 'trajectory')} included, "
             f"{self.expected - len(self.rows)} to compute, {told['retried']} retried"
         ]
+        lines += [f"  {name} is missing" for name in sorted(self.missing)]
         lines += [f"  {verdict:<9} {count}" for verdict, count in told["verdicts"].items() if count]
         lines += [f"  {split:<9} {count}" for split, count in told["splits"].items()]
         excluded = told["excluded"]
@@ -102,7 +114,8 @@ def status_of(path: Path) -> Status:
     manifest = Manifest(path)
     facts, rows = manifest.facts(), manifest.rows()
     folder = Folder(path, facts["count"], facts["per_shard"], tuple(facts["part"]))
-    return Status(path, folder.part, folder.expected, tuple(rows))
+    missing = frozenset(name for name in {row.file for row in rows} if name and not (path / name).is_file())
+    return Status(path, folder.part, folder.expected, tuple(rows), missing)
 
 
 @dataclass(frozen=True)

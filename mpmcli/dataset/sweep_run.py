@@ -27,6 +27,7 @@ from mpmcli.dataset.folder import (
     Row,
     copied_files,
     copy_sources,
+    is_beginning,
     require_empty,
     source_digests,
     source_files,
@@ -38,7 +39,7 @@ from mpmcli.dataset.sweep import Sweep
 from mpmcli.errors import InputError
 from mpmcli.materials.registry import load_plugins
 from mpmcli.output.checksums import path_digest
-from mpmcli.output.durable import SPACE_MARGIN, TEMPORARY_SUFFIX, remove_numbered, write_text
+from mpmcli.output.durable import SPACE_MARGIN, remove_numbered, write_text
 from mpmcli.output.lock import LOCK, refuse_locked, take_lock
 from mpmcli.plain_text import counted, duration_text, size_text, text_table
 from mpmcli.scene import Scene, estimate_particles
@@ -173,10 +174,7 @@ def open_folder(
             f"{directory} holds a dataset: --resume goes on with it, --overwrite replaces it, and -o gives another "
             "directory."
         )
-    there = [path.name.removesuffix(TEMPORARY_SUFFIX) for path in directory.iterdir()] if directory.is_dir() else [""]
-    # A sweep may have been killed here before it wrote a manifest.
-    begun = {name.removesuffix("-journal") for name in there} <= {SWEEP, BASE, MANIFEST, LOCK}
-    if not (replaces or (settings.resume and begun)):
+    if not (replaces or (settings.resume and is_beginning(directory))):
         require_empty(directory)
     earlier = manifest.facts().get("files", {}) if replaces else {}
     texts, digests = {SWEEP: standing_alone(sweep), BASE: sweep.base_text}, source_digests(sweep, settings.plugins)
