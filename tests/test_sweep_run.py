@@ -415,6 +415,33 @@ def test_keys_of_the_base_are_set_and_a_dataset_is_replaced(tmp_path: Path) -> N
     assert bad.status == 2 and 'did you mean "frames"' in bad.stderr and not (tmp_path / "e").exists()
 
 
+@pytest.mark.parametrize("name", ["one%20way", "100%", "a?mode=memory", "#1", "one way"])
+@pytest.mark.usefixtures("made_workers")
+def test_the_rows_are_those_of_the_path_that_is_given(name: str) -> None:
+    """Whatever a URI would read in it, beside a dataset whose name is what it would read."""
+    if name != "one way":
+        make_dataset("one way/d", count=3)
+    dataset = make_dataset(f"{name}/d", count=9)
+    assert status_of(dataset).expected == len(Manifest(dataset).rows()) == 9
+    outcome = run_here("dataset", "verify", dataset, "--json")
+    assert outcome.status == 0 and json.loads(outcome.stdout)["trajectories"] == 9
+
+
+def test_a_path_that_is_not_utf_8_gets_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As an option, an argument, and where the command runs; nothing is written."""
+    write_sweep(tmp_path)
+    bad = Path(os.fsdecode(bytes(tmp_path / "caf") + b"\xe9"))
+    bad.mkdir()
+    commands = [("sweep", tmp_path / "sweep.toml", "-o", bad / "d"), ("dataset", "status", bad), ("info", bad)]
+    for words in [*commands, ("simulate", "base.toml", "-o", "r")]:
+        if words not in commands:
+            shutil.copy(tmp_path / "base.toml", bad)
+            monkeypatch.chdir(bad)
+        outcome = run_here(*words)
+        assert outcome.status == 2 and "is not UTF-8" in outcome.stderr and outcome.stderr.count("\n") == 1, outcome
+    assert [path.name for path in bad.iterdir()] == ["base.toml"]
+
+
 def files_of(directory: Path) -> dict[str, bytes]:
     return {str(path.relative_to(directory)): path.read_bytes() for path in directory.rglob("*") if path.is_file()}
 

@@ -7,10 +7,23 @@ from pathlib import Path
 
 import click
 
-PATH = click.Path(path_type=Path)
+
+class Utf8Path(click.Path):
+    """A path, which the files of a result or a dataset name as UTF-8."""
+
+    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        path = super().convert(value, param, ctx)
+        try:
+            str(path.absolute()).encode()
+        except UnicodeEncodeError:
+            self.fail(f"{bytes(path)!r} is not UTF-8, or lies in a directory whose name is not; rename it", param, ctx)
+        return path
 
 
-class SceneOrResult(click.Path):
+PATH = Utf8Path(path_type=Path)
+
+
+class SceneOrResult(Utf8Path):
     """A path, or the name of an example scene if no file has that name."""
 
     def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> Path:

@@ -146,7 +146,7 @@ class Manifest:
             raise InputError(f"{self.path.parent} is not a dataset: it has no {MANIFEST}.")
         try:
             # Not mode=ro, which cannot roll back the changes of a killed writer.
-            with closing(sqlite3.connect(f"file:{self.path}?mode=rw", uri=True)) as connection:
+            with closing(sqlite3.connect(f"{self.path.absolute().as_uri()}?mode=rw", uri=True)) as connection:
                 yield connection
         except (sqlite3.Error, ValueError) as error:
             what = first_line(error)
