@@ -27,7 +27,7 @@ from tiny_sweep import BASE, contents, small_shards, tiny_sweep, told, write_swe
 from mpmcli.dataset import open as open_dataset
 from mpmcli.dataset.compute import Task, _with_step, compute
 from mpmcli.dataset.draw import draw
-from mpmcli.dataset.folder import Manifest, source_files, standing_alone
+from mpmcli.dataset.folder import Manifest, program, source_files, standing_alone
 from mpmcli.dataset.merge import merge
 from mpmcli.dataset.report import status_of, verify
 from mpmcli.dataset.sweep import Sweep
@@ -106,6 +106,27 @@ def test_parts_and_another_number_of_workers_make_the_same_dataset(
     with pytest.raises(InputError, match="a part is given twice"):
         merge([parts[0], parts[0], parts[1]], tmp_path / "half")
     assert not (tmp_path / "half").exists()
+
+
+@pytest.mark.parametrize("column", ["version", "taichi", "arch"])
+@pytest.mark.usefixtures("made_workers")
+def test_trajectories_of_another_program_are_not_joined(column: str) -> None:
+    """By --resume or merge; both are named, and nothing changes. Those that failed are computed again anyway."""
+    make_dataset("d", broken_after=0)
+    parts = [make_dataset(f"part{i}", (i, 2)) for i in (1, 2)]
+    for dataset, words in ((Path("d"), ("sweep", "sweep.toml", "-o", "d")), (parts[1], ("dataset", "merge"))):
+        manifest = Manifest(dataset)
+        manifest.put(replace(row, **{column: "older"}) for row in manifest.rows() if row.accepted)
+        before, now = files_of(dataset), {"arch": "cpu", **program()}[column]
+        more = ("--resume", "--count", 12, "--arch", "cpu") if dataset == Path("d") else (*parts, "-o", "whole")
+        outcome = run_here(*words, *more)
+        name = {"version": "mpmcli", "taichi": "Taichi", "arch": "--arch"}[column]
+        assert outcome.status == 2 and f"computed with {name} older; those of {now} would" in outcome.stderr, outcome
+        assert files_of(dataset) == before and not Path("whole").exists()
+        manifest.put(replace(row, verdict="failed", accepted=0) for row in manifest.rows())
+    if column != "arch":
+        assert run_here("sweep", "sweep.toml", "-o", "d", "--resume", "--count", 12, "-q").status == 1
+        assert {getattr(row, column) for row in Manifest(Path("d")).rows()} == {now}
 
 
 @pytest.mark.usefixtures("made_workers")

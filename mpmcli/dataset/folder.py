@@ -24,7 +24,7 @@ from mpmcli.check.finding import Verdict
 from mpmcli.dataset.shard import BASE, PENDING, QUARANTINE, SHARDS, SWEEP, checksum, group_name, join_trajectories
 from mpmcli.dataset.sweep import Sweep
 from mpmcli.errors import InputError, RunError
-from mpmcli.output.checksums import checksum_is_right, first_line, path_digest, require_format
+from mpmcli.output.checksums import first_line, path_digest, require_format
 from mpmcli.output.directory import check_directory
 from mpmcli.output.durable import TEMPORARY_SUFFIX, require_free_space, sealed
 from mpmcli.output.lock import LOCK
@@ -74,7 +74,12 @@ class Row:
         """Return the row of a failed trajectory without further facts."""
         values: dict[str, Any] = {f.name: f.type() for f in fields(cls)}
         values |= {"number": number, "split": split, "draws": "{}", "verdict": "failed", "reason": reason}
-        return cls(**{**values, "version": __version__, "taichi": version("taichi")})
+        return cls(**{**values, **program()})
+
+
+def program() -> dict[str, str]:
+    """Return the versions of mpmcli and Taichi, on which the bytes of a trajectory depend."""
+    return {"version": __version__, "taichi": version("taichi")}
 
 
 class _SweepFacts(BaseModel):
@@ -88,6 +93,8 @@ class _SweepFacts(BaseModel):
     part: list[int] = Field(min_length=2, max_length=2)
 
 
+# Columns on which the bytes of a trajectory depend, in words.
+PROGRAM = {"version": "mpmcli", "taichi": "Taichi", "arch": "--arch"}
 _ROWS = TypeAdapter(list[Row])
 _COLUMNS = ", ".join(f.name for f in fields(Row))
 _TYPES = {int: "INTEGER", float: "REAL", str: "TEXT"}
@@ -160,6 +167,17 @@ def require_empty(directory: Path, *, locked: bool = False) -> None:
     check_directory(directory, overwrite=False, locked=locked)
 
 
+def require_same_program(place: Path, found: Iterable[Mapping[str, Any]], now: Mapping[str, str]) -> None:
+    """Refuse trajectories of another version of mpmcli or Taichi or backend than `now`, by column; "auto" is any."""
+    for before in found:
+        for name, value in now.items():
+            if value not in ("auto", before.get(name, value)):
+                raise InputError(
+                    f"{place} holds trajectories computed with {PROGRAM[name]} {before[name]}; those of {value} would "
+                    "differ: compute all of them with one."
+                )
+
+
 def is_beginning(directory: Path) -> bool:
     """Return whether a directory holds what a process leaves that is killed before its dataset has a manifest."""
     names = [path.name for path in directory.iterdir()] if directory.is_dir() else [MANIFEST]
@@ -199,16 +217,6 @@ class Folder:
     def shard_file(self, shard: int) -> str:
         """Return the path of a shard in the dataset."""
         return f"{SHARDS}/{shard:05d}.h5"
-
-    def is_kept(self, row: Row) -> bool:
-        """Return whether a row is final: its frames are in its file.
-
-        A failed trajectory is tried again, and so is one whose single file is damaged and cannot enter a shard.
-        """
-        path = self.path / row.file
-        if row.verdict == "failed" or not row.file:
-            return row.verdict != "failed"
-        return path.is_file() and (row.file.startswith(f"{SHARDS}/") or checksum_is_right(path))
 
     def seal(self, shard: int, rows: Mapping[int, Row]) -> list[Row]:
         """Join accepted trajectories to a shard durably, return changed rows; RunError: the single files are kept."""

@@ -5,7 +5,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from mpmcli.dataset.folder import Manifest, Row, copy_sources, is_beginning, require_empty
+from mpmcli.dataset.folder import (
+    PROGRAM,
+    Manifest,
+    Row,
+    copy_sources,
+    is_beginning,
+    require_empty,
+    require_same_program,
+)
 from mpmcli.dataset.report import CARD, Status, status_of, verify, write_card
 from mpmcli.dataset.shard import BASE, QUARANTINE, SHARDS, SWEEP
 from mpmcli.errors import InputError, RunError
@@ -19,7 +27,11 @@ def merge(parts: Sequence[Path], target: Path) -> Status:
     InputError, nothing written: a part or the target is unsuitable.
     """
     facts = [Manifest(part).facts() for part in parts]
+    rows = [row for part in parts for row in Manifest(part).rows()]
+    first = next((vars(row) for row in rows if row.verdict != "failed"), facts[0])
     for part, its in zip(parts, facts, strict=True):
+        done = [vars(row) for row in Manifest(part).rows() if row.verdict != "failed"]
+        require_same_program(part, [its, *done], {name: first[name] for name in PROGRAM if name in first})
         if {**its, "part": None} != {**facts[0], "part": None}:
             raise InputError(f"{part} has another sweep, other files or another version of mpmcli than {parts[0]}.")
     count = facts[0]["part"][1]
@@ -34,7 +46,6 @@ def merge(parts: Sequence[Path], target: Path) -> Status:
     for part in parts:
         if faults := verify(part).faults:
             raise InputError(f"{part} cannot be merged: {faults[0]}")
-    rows = [row for part in parts for row in Manifest(part).rows()]
     manifest, told = Manifest(target), {**facts[0], "part": [1, 1]}
     files = [
         file

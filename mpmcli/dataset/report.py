@@ -43,7 +43,7 @@ MOST_NAMED = 10
 class Status:
     """Counts of a dataset with `part` (i, n) of a sweep: `expected` trajectories, and `rows` of those tried.
 
-    `missing` files of trajectories do not exist.
+    `missing` files of trajectories do not exist; trajectories with the numbers `waiting` have not been tried.
     """
 
     path: Path
@@ -51,6 +51,7 @@ class Status:
     expected: int
     rows: tuple[Row, ...]
     missing: frozenset[str] = frozenset()
+    waiting: frozenset[int] = frozenset()
 
     @property
     def accepted(self) -> int:
@@ -115,7 +116,8 @@ def status_of(path: Path) -> Status:
     facts, rows = manifest.facts(), manifest.rows()
     folder = Folder(path, facts["count"], facts["per_shard"], tuple(facts["part"]))
     missing = frozenset(name for name in {row.file for row in rows} if name and not (path / name).is_file())
-    return Status(path, folder.part, folder.expected, tuple(rows), missing)
+    waiting = frozenset(folder.all_numbers()) - {row.number for row in rows}
+    return Status(path, folder.part, folder.expected, tuple(rows), missing, waiting)
 
 
 @dataclass(frozen=True)
@@ -144,18 +146,30 @@ def verify(path: Path, on_file: Callable[[int, int], None] = lambda done, total:
     missing = status.expected - len(status.rows)
     if missing:
         faults.append(f"{counted(missing, 'trajectory')} not computed; mpmcli sweep --resume goes on.")
-    by_file: dict[str, list[Row]] = {}
-    for row in status.rows:
-        if row.file:
-            by_file.setdefault(row.file, []).append(row)
-        elif row.accepted:
-            faults.append(f"trajectory {row.number} is included, but has no file.")
+    by_file = _by_file(status.rows)
+    faults += [
+        f"trajectory {row.number} is included, but has no file." for row in status.rows if row.accepted and not row.file
+    ]
     others = set((path / SHARDS).glob("*.h5")) - {path / name for name in by_file}
     faults += [f"{other} is in no row of the manifest." for other in sorted(others)]
     for done, (name, rows) in enumerate(sorted(by_file.items()), 1):
         faults += _faults_of(path / name, rows)
         on_file(done, len(by_file))
     return Verification(path, sum(len(rows) for rows in by_file.values()), tuple(faults))
+
+
+def final_rows(path: Path, rows: Sequence[Row]) -> list[Row]:
+    """Return the rows that are not computed again: neither failed, nor with a file that is missing or damaged."""
+    faulty = {name for name, its in _by_file(rows).items() if _faults_of(path / name, its)}
+    return [row for row in rows if row.verdict != "failed" and row.file not in faulty]
+
+
+def _by_file(rows: Sequence[Row]) -> dict[str, list[Row]]:
+    found: dict[str, list[Row]] = {}
+    for row in rows:
+        if row.file:
+            found.setdefault(row.file, []).append(row)
+    return found
 
 
 def _faults_of(file: Path, rows: list[Row]) -> list[str]:

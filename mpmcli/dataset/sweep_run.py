@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from mpmcli import __version__
 from mpmcli.check.facts import SceneFacts
 from mpmcli.check.forecast import expected_steps, layout_of, seconds_of_one
 from mpmcli.cores import available_cores
@@ -28,12 +27,14 @@ from mpmcli.dataset.folder import (
     copied_files,
     copy_sources,
     is_beginning,
+    program,
     require_empty,
+    require_same_program,
     source_digests,
     source_files,
     standing_alone,
 )
-from mpmcli.dataset.report import remove_card, write_card
+from mpmcli.dataset.report import final_rows, remove_card, write_card
 from mpmcli.dataset.shard import BASE, LABELS, NUMBERED, PENDING, QUARANTINE, SHARDS, SWEEP, file_name
 from mpmcli.dataset.sweep import Sweep
 from mpmcli.errors import InputError
@@ -165,6 +166,8 @@ def open_folder(
                 f"{changed[0]} has changed since {directory} was begun, which cannot be resumed with it: put it back "
                 "as it was, or give another directory with -o."
             )
+        rows = [vars(row) for row in manifest.rows() if row.verdict != "failed"]
+        require_same_program(directory, [facts, *rows], {**program(), "arch": settings.arch})
         return Folder(directory, sweep.count, facts["per_shard"], settings.part), manifest
     replaces = settings.overwrite and directory.is_dir() and any(path.name != LOCK for path in directory.iterdir())
     if replaces and not (directory / MANIFEST).exists():
@@ -207,7 +210,7 @@ def open_folder(
     facts = {"key": sweep.key, "count": sweep.count, "seed": sweep.seed, "accept": sweep.accept, "files": digests}
     for name, text in texts.items():
         write_text(directory / name, text)
-    manifest.create({**facts, "per_shard": per_shard, "part": list(settings.part), "version": __version__})
+    manifest.create({**facts, "per_shard": per_shard, "part": list(settings.part), **program()})
     copy_sources(digests, sweep.base.parent, directory)
     return folder, manifest
 
@@ -324,8 +327,11 @@ class _Run:
     """Enters rows into the manifest, and seals each shard after its last row."""
 
     def __init__(self, sweep: Sweep, settings: SweepSettings, folder: Folder, manifest: Manifest) -> None:
-        self.sweep, self.settings, self.folder, self.manifest = sweep, settings, folder, manifest
-        self.rows = {row.number: row for row in manifest.rows() if folder.is_kept(row)}
+        self.sweep, self.folder, self.manifest = sweep, folder, manifest
+        self.rows = {row.number: row for row in final_rows(folder.path, manifest.rows())}
+        # A dataset is computed on one backend, that of its first trajectories.
+        arch = next((row.arch for row in self.rows.values()), settings.arch)
+        self.settings = replace(settings, arch=arch)
         self.state = SweepState(settings.directory, folder.expected, len(self.rows))
         for row in self.rows.values():
             self.state.count(row)
