@@ -7,23 +7,10 @@ from pathlib import Path
 
 import click
 
-
-class Utf8Path(click.Path):
-    """A path, which the files of a result or a dataset name as UTF-8."""
-
-    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> Path:
-        path = super().convert(value, param, ctx)
-        try:
-            str(path.absolute()).encode()
-        except UnicodeEncodeError:
-            self.fail(f"{bytes(path)!r} is not UTF-8, or lies in a directory whose name is not; rename it", param, ctx)
-        return path
+PATH = click.Path(path_type=Path)
 
 
-PATH = Utf8Path(path_type=Path)
-
-
-class SceneOrResult(Utf8Path):
+class SceneOrResult(click.Path):
     """A path, or the name of an example scene if no file has that name."""
 
     def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> Path:

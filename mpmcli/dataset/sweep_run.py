@@ -173,10 +173,7 @@ def open_folder(
     if replaces and not (directory / MANIFEST).exists():
         raise InputError(f"{directory} holds no dataset, and --overwrite replaces nothing else.")
     if not replaces and (directory / MANIFEST).exists():
-        raise InputError(
-            f"{directory} holds a dataset: --resume goes on with it, --overwrite replaces it, and -o gives another "
-            "directory."
-        )
+        raise InputError(f"{directory} holds a dataset: --resume goes on with it, and --overwrite replaces it.")
     if not (replaces or (settings.resume and is_beginning(directory))):
         require_empty(directory)
     earlier = manifest.facts().get("files", {}) if replaces else {}
@@ -230,12 +227,8 @@ def _spare_files(
         if path.resolve() in inputs and path.read_text(encoding="utf-8") != text:
             raise InputError(f"{path} is read by this sweep, which would change it: give another directory with -o.")
     for name in copied_files(digests):
-        path = directory / name
-        if (
-            path.exists()
-            and path.resolve() not in inputs
-            and path_digest(path) not in (earlier.get(name), digests[name])
-        ):
+        path, known = directory / name, (earlier.get(name), digests[name])
+        if path.exists() and path.resolve() not in inputs and path_digest(path) not in known:
             raise InputError(f"{path} would be replaced by a file of the sweep: give another directory with -o.")
 
 
@@ -330,7 +323,7 @@ class _Run:
         self.sweep, self.folder, self.manifest = sweep, folder, manifest
         self.rows = {row.number: row for row in final_rows(folder.path, manifest.rows())}
         # A dataset is computed on one backend, that of its first trajectories.
-        arch = next((row.arch for row in self.rows.values()), settings.arch)
+        arch = next((row.arch for row in self.rows.values() if row.arch), settings.arch)
         self.settings = replace(settings, arch=arch)
         self.state = SweepState(settings.directory, folder.expected, len(self.rows))
         for row in self.rows.values():

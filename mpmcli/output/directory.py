@@ -22,11 +22,9 @@ NAMES = (PACKED, DAMAGED, SCENE, RECORD, RESTING, MOVING)
 
 @dataclass
 class TakenDirectory:
-    """A directory locked by this process until `release`.
+    """A directory locked by this process until `release`; `made` lists the directories created, outermost first.
 
-    Attributes:
-        made: directories created, outermost first; spared: resolved paths of files that are never removed.
-        replaces: whether it holds an earlier result, which `clear` removes.
+    `spared` resolved paths are never removed; `replaces`: whether it holds an earlier result, which `clear` removes.
     """
 
     path: Path

@@ -54,7 +54,7 @@ def sync_directory(directory: Path) -> None:
 def sealed(path: Path, size: int = 0, *, unique: bool = False) -> Iterator[Path]:
     """Yield a temporary path; on exit, move it to `path` durably. OSError: there is no space for `size` bytes.
 
-    The temporary path is `unique` where no lock keeps other processes from writing the same file.
+    It must be `unique` where no lock keeps other processes from writing the same file.
     """
     file = Unsealed(path, unique=unique)
     with file.written(size) as temporary:
@@ -129,10 +129,7 @@ def numbered_files(folder: Path, names: re.Pattern[str]) -> list[Path]:
 
 
 def remove_numbered(folder: Path, names: re.Pattern[str], spared: Collection[Path] = ()) -> None:
-    """Remove files with such names, also unfinished ones, and the folder unless it contains other files.
-
-    `spared` are resolved paths.
-    """
+    """Remove files with such names, also unfinished ones, but no `spared` resolved paths; and the folder, if empty."""
     if not folder.is_dir():
         return
     for path in folder.iterdir():
