@@ -14,7 +14,7 @@ from made_dataset import made_trajectory
 from mpmcli.dataset import sweep_run
 from mpmcli.dataset.compute import Task
 from mpmcli.dataset.draw import draw
-from mpmcli.dataset.folder import Row
+from mpmcli.dataset.folder import Row, program
 from mpmcli.dataset.shard import PENDING, QUARANTINE, checksum, file_name, group_name, write_trajectory
 from mpmcli.dataset.sweep import Sweep
 from mpmcli.dataset.sweep_run import SweepSettings, run_sweep
@@ -59,8 +59,7 @@ def made_row(task: Task, number: int) -> Row:
         seconds=1.0 + id(path) % 1000,
         arch="cpu",
         precision="f32",
-        version="0",
-        taichi="0",
+        **program(),
         file=file,
         checksum=found,
     )

@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import os
 import signal
 import time
 from pathlib import Path
@@ -11,7 +12,9 @@ import pytest
 from command import SCENE, run_here, started
 
 from mpmcli.cli.interrupt import catch_interrupts, interrupt_came, interrupts_wait
-from mpmcli.output import open_result
+from mpmcli.errors import DiskFullError
+from mpmcli.output import open_result, store
+from mpmcli.solver.engine.run import Run
 
 # The run is longer than any machine needs until the signal comes.
 LONG = SCENE.replace("end = 0.05", "end = 5000.0").replace("frames = 4", "frames = 2000")
@@ -82,6 +85,38 @@ def test_an_interrupt_ends_the_run_at_its_next_frame(tmp_path, monkeypatch):
     outcome = run_here("simulate", tmp_path / "scene.toml", "-o", tmp_path / "result")
     assert outcome.status == 130 and "error: the run was interrupted" in outcome.stderr
     assert open_result(tmp_path / "result").frame_count == 1
+
+
+@pytest.mark.parametrize("fault", ["Ctrl-C", "a full disk", "none"])
+def test_an_earlier_result_stays_until_a_frame_takes_its_place(tmp_path, monkeypatch, fault):
+    """Computed again from the scene in its own directory; until then it is as it was, byte for byte."""
+    (tmp_path / "scene.toml").write_text(SCENE, encoding="utf-8")
+    directory = tmp_path / "result"
+    assert run_here("simulate", tmp_path / "scene.toml", "-o", directory, "-q").status == 0
+    before = {path.name: path.read_bytes() for path in directory.iterdir()}
+    sealed = store.Unsealed.seal
+
+    def seal(file: store.Unsealed) -> None:
+        # The first new frame is written, and has not its name yet.
+        if file.path.name == "frame_000000.vtkhdf":
+            assert sorted(os.listdir(directory)) == ["run.json", "run.lock", "scene.toml", "segments"]
+        sealed(file)
+
+    def refuse(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt if fault == "Ctrl-C" else DiskFullError("The disk is full.")
+
+    monkeypatch.setattr(store.Unsealed, "seal", seal)
+    if fault != "none":
+        place, name = {"Ctrl-C": (Run, "frames"), "a full disk": (store, "require_free_space")}[fault]
+        monkeypatch.setattr(place, name, refuse)
+    outcome = run_here("simulate", directory / "scene.toml", "-o", directory, "--overwrite", "--set", "time.frames=2")
+    after = {path.name: path.read_bytes() for path in directory.iterdir()}
+    if fault == "none":
+        assert outcome.status == 0 and open_result(directory).frame_count == 3 and sorted(after) == sorted(before)
+    else:
+        assert outcome.status == {"Ctrl-C": 130, "a full disk": 1}[fault], outcome
+        assert outcome.stderr.endswith(f"; the earlier result in {directory} is kept.\n"), outcome
+        assert after == before
 
 
 def test_an_interrupt_that_became_another_error_is_still_one(tmp_path, monkeypatch):

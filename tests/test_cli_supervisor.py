@@ -90,7 +90,7 @@ def test_a_second_signal_does_not_wait() -> None:
 def test_the_result_of_a_child_that_was_ended_is_closed(tmp_path: Path) -> None:
     """A run without a frame leaves nothing, not even the directories made for it."""
     before = (
-        f"place = Path({str(tmp_path)!r}) / 'a' / 'b'; supervisor.announce(place); "
+        f"place = Path({str(tmp_path)!r}) / 'a' / 'b'; supervisor.announce(place, []); "
         "from mpmcli.output import RunRecord; from mpmcli.output.directory import take_directory; "
         "take_directory(place, False); RunRecord(place).write()"
     )

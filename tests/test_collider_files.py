@@ -94,7 +94,8 @@ def test_a_series_lists_both_and_overwrite_takes_all_away(tmp_path: Path) -> Non
     assert set(paddle.cell_data["collider"].tolist()) == {0}
     assert (tmp_path / RESTING_PIECE).exists()
     # The record that a run leaves makes the directory one of results.
-    take_directory(tmp_path, overwrite=True).release()
+    with take_directory(tmp_path, overwrite=True) as taken:
+        taken.clear()
     assert not list(tmp_path.glob("colliders*"))
 
 

@@ -13,7 +13,7 @@ import mpmcli.dataset
 from mpmcli.dataset.export import ExportSettings, export
 from mpmcli.dataset.folder import MANIFEST, Manifest
 from mpmcli.dataset.merge import merge
-from mpmcli.dataset.report import DrawnComponent, first_paragraph, histogram, values_of, write_card
+from mpmcli.dataset.report import MARKS, DrawnComponent, first_paragraph, histogram, values_of, write_card
 
 pytestmark = pytest.mark.usefixtures("made_workers")
 
@@ -97,6 +97,31 @@ def test_the_picture_is_shown_where_it_lies():
     (dataset / "montage.png").write_bytes(b"")
     write_card(dataset)
     assert "](montage.png)" in card_of(dataset)
+
+
+BEGIN, END = MARKS
+
+
+@pytest.mark.parametrize(
+    ("above", "old", "below"),
+    [
+        (b"# Ours\r\n\r\nCite us: \xff.\r\n\n", b"", b""),
+        (b"Above.\n", BEGIN + b"\nold\n" + END + b"\n", b"Below.\n"),
+        (BEGIN + b"\nno end\n\n", b"", b""),
+        (BEGIN + b"\nno end\n", BEGIN + b"\nold\n" + END + b"\n", b"Below.\n"),
+    ],
+    ids=["no marks", "marks", "no end mark", "a mark too many"],
+)
+def test_the_text_of_its_owner_is_kept(above, old, below):
+    """Byte for byte, around the card; written twice, the file is the same."""
+    dataset = make_dataset("whole")
+    readme = dataset / "README.md"
+    card = readme.read_bytes()
+    assert card.startswith(BEGIN) and card.endswith(END + b"\n")
+    # A card that is not there yet comes after an empty line.
+    readme.write_bytes(above + old + below if old else above[:-1])
+    for _ in range(2):
+        assert write_card(dataset).read_bytes() == above + card + below
 
 
 def test_a_dataset_without_trajectories_has_a_card(monkeypatch):

@@ -1,7 +1,11 @@
 """Datasets are read as they were written: shards, single results, slices, and sentences for what cannot be read."""
 
 import hashlib
+import json
 import pickle
+import re
+import shutil
+import sqlite3
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -9,12 +13,18 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from command import run_here
 from made_dataset import COUNTS, made_dataset, made_trajectory, write_dataset
 from made_result import made_frame, write_made
+from made_sweep import made_workers, make_dataset, small_sweep  # noqa: F401
 
 import mpmcli.dataset
 from mpmcli.dataset import folder
+from mpmcli.dataset.dataset import open_dataset
+from mpmcli.dataset.folder import MANIFEST, Manifest
+from mpmcli.dataset.report import verify
 from mpmcli.dataset.shard import write_single, write_trajectory
+from mpmcli.dataset.sweep_run import SweepSettings, run_sweep
 from mpmcli.errors import InputError
 
 
@@ -166,14 +176,52 @@ def computed(directory: Path, number: int) -> folder.Row:
     return replace(row, verdict="stable", accepted=1, file=f"pending/{path.name}", checksum=known)
 
 
-def test_a_trajectory_whose_file_is_damaged_is_computed_again(tmp_path):
-    """Its shard could not be sealed, however often the sweep is resumed."""
-    place, row = folder.Folder(tmp_path, 4, 4, (1, 1)), computed(tmp_path, 0)
-    assert place.is_kept(row)
-    content = (tmp_path / row.file).read_bytes()
-    for damaged in (content[:-100], content[:5000] + b"?" + content[5001:]):
-        (tmp_path / row.file).write_bytes(damaged)
-        assert not place.is_kept(row)
+@pytest.mark.usefixtures("made_workers")
+def test_what_verify_finds_is_computed_again_on_resume():
+    """A changed byte of a shard, of its attributes or in quarantine; a shard that is gone, or is that of another."""
+    dataset, rows = make_dataset("d"), Manifest(Path("d")).rows()
+    whole = {path.relative_to(dataset): path.read_bytes() for path in dataset.rglob("*.h5")}
+    flipped = ("shards/00000.h5", "quarantine/000004.h5", "shards/00001.h5")
+    other = whole[Path("shards/00001.h5")]
+    for k, (name, content) in enumerate({**dict.fromkeys(flipped), "shards/00002.h5": other}.items()):
+        data = bytearray(whole[Path(name)])
+        data[len(data) // (k + 2)] ^= 1
+        (dataset / name).write_bytes(content or data)
+        (dataset / "shards" / "00003.h5").unlink()
+        assert verify(dataset).faults
+        state = run_sweep(small_sweep(), SweepSettings(dataset, resume=True))
+        assert (state.status, state.done) == ("finished", 12)
+        assert state.kept == 12 - sum(row.file in (name, "shards/00003.h5") for row in rows)
+        assert verify(dataset).faults == ()
+        assert {path.relative_to(dataset): path.read_bytes() for path in dataset.rglob("*.h5")} == whole
+    # One that waits for its shard.
+    asked = iter([False, False, True])
+    assert run_sweep(small_sweep(), SweepSettings(Path("e")), stop=lambda: next(asked)).done == 2
+    single = Path("e/pending/000001.h5")
+    single.write_bytes(single.read_bytes()[:-100])
+    assert run_sweep(small_sweep(), SweepSettings(Path("e"), resume=True)).kept == 1
+    assert {path.relative_to("e"): path.read_bytes() for path in Path("e").rglob("*.h5")} == whole
+
+
+@pytest.mark.usefixtures("made_workers")
+def test_missing_trajectories_are_named(drawing):
+    """Where a dataset is opened, drawn or counted: those whose shard is gone, and those not computed yet."""
+    dataset = make_dataset("d")
+    assert mpmcli.dataset.open(dataset).missing == ()
+    (dataset / "shards" / "00001.h5").unlink()
+    said = "d lacks 2 trajectories of its sweep (3, 5): mpmcli sweep --resume computes them."
+    with pytest.warns(UserWarning, match=re.escape(said)):
+        opened = mpmcli.dataset.open(dataset)
+    assert opened.missing == (3, 5) and set(opened.numbers) == set(range(12)) - {3, 4, 5, 9}
+    drawn = run_here("render", dataset, "--montage", "2x2", "--json", "--color-by", "speed")
+    assert drawn.status == 0 and json.loads(drawn.stdout)["warnings"] == [said], drawn.stderr
+    assert json.loads(run_here("dataset", "status", dataset, "--json").stdout)["missing"] == [3, 5]
+    with sqlite3.connect(dataset / MANIFEST) as manifest:
+        manifest.execute("DELETE FROM trajectories WHERE number > 5")
+    shutil.rmtree(dataset / "quarantine")
+    for name in ("00002.h5", "00003.h5"):
+        (dataset / "shards" / name).unlink()
+    assert open_dataset(dataset).missing == (3, 5, *range(6, 12))
 
 
 def test_a_shard_that_is_sealed_again_asks_for_its_own_size(tmp_path, monkeypatch):

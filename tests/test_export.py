@@ -473,6 +473,22 @@ def test_an_interrupted_export_leaves_what_was_there(tmp_path, monkeypatch, earl
     assert everything(tmp_path) == before
 
 
+@pytest.mark.parametrize("replaced", [False, True])
+def test_an_export_that_a_killed_one_has_set_aside_comes_back(tmp_path, replaced):
+    """Killed between its two renames, or after them: the next call finds one export under the name."""
+    path, target = made_dataset(tmp_path / "set"), tmp_path / "out"
+    assert run_here("export", path, "--to", "gns", "-o", target).status == 0
+    before = everything(target)
+    target.rename(tmp_path / "out.4711.old.tmp")
+    if replaced:
+        assert run_here("export", path, "--to", "npz", "-o", tmp_path / "new").status == 0
+        (tmp_path / "new").rename(target)
+        before = everything(target)
+    refusal = run_here("export", path, "--to", "npz", "-o", target)
+    assert refusal.status == 2 and "not empty" in refusal.stderr
+    assert everything(target) == before and sorted(os.listdir(tmp_path)) == ["out", "set"]
+
+
 def test_the_answer_is_a_line_on_stdout(tmp_path):
     outcome = run_here("export", made_dataset(tmp_path / "set"), "--to", "npz", "-o", tmp_path / "out")
     assert outcome.stdout.startswith(

@@ -11,16 +11,16 @@ from test_output_frames import make_frame, make_row
 
 from mpmcli.errors import InputError
 from mpmcli.output import RunRecord, SegmentStore, open_result, read_record
-from mpmcli.output.directory import take_directory
+from mpmcli.output.directory import close_abandoned, take_directory
 from mpmcli.output.durable import sealed, write_text
 from mpmcli.output.series import write_series
 
 
 def taken(directory: Path, overwrite: bool) -> Path:
-    """Take a directory, leave it to others at once, and return it."""
-    lock = take_directory(directory, overwrite)
-    lock.release()
-    return lock.path
+    """Take a directory, clear it, leave it to others at once, and return it."""
+    with take_directory(directory, overwrite) as taken:
+        taken.clear()
+    return taken.path
 
 
 def write_result(directory: Path, *, finish: bool) -> None:
@@ -92,6 +92,26 @@ def test_overwrite_spares_a_scene_of_the_user(tmp_path):
     with pytest.raises(InputError, match=r"scene\.toml was not written by mpmcli"):
         taken(tmp_path, overwrite=True)
     assert (tmp_path / "scene.toml").read_text() == "title = 'mine'\n"
+
+
+def test_an_earlier_result_stays_until_it_is_cleared(tmp_path):
+    """Without the files that the new run reads; one that it would replace later is refused at once."""
+    write_result(tmp_path, finish=True)
+    scene, packed = tmp_path / "scene.toml", tmp_path / "particles.vtkhdf"
+    before = sorted(os.listdir(tmp_path))
+    with pytest.raises(KeyboardInterrupt), take_directory(tmp_path, overwrite=True) as directory:
+        raise KeyboardInterrupt
+    assert directory.replaces
+    # Ended by force, in place of process 1.
+    close_abandoned(tmp_path, [], [], 1, "SIGINT")
+    assert sorted(os.listdir(tmp_path)) == before
+    with pytest.raises(InputError, match=r"particles\.vtkhdf is read by the scene"):
+        take_directory(tmp_path, overwrite=True, inputs=[packed])
+    assert sorted(os.listdir(tmp_path)) == before
+    with pytest.raises(KeyboardInterrupt), take_directory(tmp_path, overwrite=True, inputs=[scene]) as directory:
+        directory.clear()
+        raise KeyboardInterrupt
+    assert os.listdir(tmp_path) == ["scene.toml"]
 
 
 def test_overwrite_does_not_remove_directories(tmp_path):

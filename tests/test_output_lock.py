@@ -68,6 +68,20 @@ def test_a_killed_holder_does_not_keep_the_directory(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_symbolic_link_is_not_followed(tmp_path: Path) -> None:
+    """Neither as the lock nor as the temporary name of a file: what it points to stays as it is."""
+    target, place = tmp_path / "precious", tmp_path / "place"
+    target.write_text("mine", encoding="utf-8")
+    place.mkdir()
+    (place / LOCK).symlink_to(target)
+    with pytest.raises(InputError, match=r"run\.lock is a symbolic link, .*: remove it"):
+        take_lock(place)
+    (place / "run.json.tmp").symlink_to(target)
+    RunRecord(place).write()
+    assert target.read_text(encoding="utf-8") == "mine" and (place / LOCK).is_symlink()
+    assert sorted(path.name for path in place.iterdir()) == ["run.json", LOCK]
+
+
 def test_of_many_that_take_it_at_once_one_has_it_at_any_time(tmp_path: Path) -> None:
     """Each writes its number into a file while it has the lock, and looks whether it is still there."""
     work = """

@@ -102,3 +102,18 @@ def test_a_full_disk_ends_the_run_and_keeps_the_picture_before(tmp_path, monkeyp
     with pytest.raises(RunError, match=r"could not be written \(No space left on device\): free some space"):
         write_picture(path, an_image(3, 3), DIGEST)
     assert path.read_bytes() == before and len(list(tmp_path.iterdir())) == 1
+
+
+def test_two_that_write_one_picture_both_end(tmp_path, monkeypatch):
+    """One writes all of its picture in the midst of the other: the last one to end gives the file."""
+    path, save, others = tmp_path / "a.png", Image.Image.save, [np.full((4, 4, 3), 200, np.uint8)]
+
+    def slow_save(image, target, **options):
+        if others:
+            write_picture(path, others.pop(), "of the other")
+            assert digest_of(path) == "of the other"
+        save(image, target, **options)
+
+    monkeypatch.setattr(Image.Image, "save", slow_save)
+    write_picture(path, np.zeros((4, 4, 3), np.uint8), "of the first")
+    assert digest_of(path) == "of the first" and os.listdir(tmp_path) == ["a.png"]

@@ -19,13 +19,15 @@ import numpy as np
 import psutil
 import pytest
 from command import ROOT, run_here, started
+from good_sweep import SWEEP
+from made_sweep import COUNT, made_workers, make_dataset, small_sweep  # noqa: F401
 from test_plugin import LAW
 from tiny_sweep import BASE, contents, small_shards, tiny_sweep, told, write_sweep
 
 from mpmcli.dataset import open as open_dataset
 from mpmcli.dataset.compute import Task, _with_step, compute
 from mpmcli.dataset.draw import draw
-from mpmcli.dataset.folder import Manifest, source_files, standing_alone
+from mpmcli.dataset.folder import Manifest, program, source_files, standing_alone
 from mpmcli.dataset.merge import merge
 from mpmcli.dataset.report import status_of, verify
 from mpmcli.dataset.sweep import Sweep
@@ -34,6 +36,7 @@ from mpmcli.dataset.sweep_run import SweepSettings, SweepState, _tasks, discard_
 from mpmcli.errors import InputError
 from mpmcli.materials.registry import parameter_models
 from mpmcli.output import open_result
+from mpmcli.output.lock import take_lock
 from mpmcli.scene.schema import Time
 from mpmcli.simulation.runner import Recording, record
 
@@ -104,14 +107,61 @@ def test_parts_and_another_number_of_workers_make_the_same_dataset(
         merge([parts[0], parts[0], parts[1]], tmp_path / "half")
     assert not (tmp_path / "half").exists()
 
-    # What is left of a merge that was ended is not whole.
-    def ended(*_: object) -> None:
-        raise KeyboardInterrupt
 
-    monkeypatch.setattr(shutil, "copyfile", ended)
-    with pytest.raises(KeyboardInterrupt):
-        merge(parts, tmp_path / "ended")
-    assert verify(tmp_path / "ended").faults
+@pytest.mark.parametrize("column", ["version", "taichi", "arch"])
+@pytest.mark.usefixtures("made_workers")
+def test_trajectories_of_another_program_are_not_joined(column: str) -> None:
+    """By --resume or merge; both are named, and nothing changes. Those that failed are computed again anyway."""
+    make_dataset("d", broken_after=0)
+    parts = [make_dataset(f"part{i}", (i, 2)) for i in (1, 2)]
+    for dataset, words in ((Path("d"), ("sweep", "sweep.toml", "-o", "d")), (parts[1], ("dataset", "merge"))):
+        manifest = Manifest(dataset)
+        manifest.put(replace(row, **{column: "older"}) for row in manifest.rows() if row.accepted)
+        before, now = files_of(dataset), {"arch": "cpu", **program()}[column]
+        more = ("--resume", "--count", 12, "--arch", "cpu") if dataset == Path("d") else (*parts, "-o", "whole")
+        outcome = run_here(*words, *more)
+        name = {"version": "mpmcli", "taichi": "Taichi", "arch": "--arch"}[column]
+        assert outcome.status == 2 and f"computed with {name} older; those of {now} would" in outcome.stderr, outcome
+        assert files_of(dataset) == before and not Path("whole").exists()
+        manifest.put(replace(row, verdict="failed", accepted=0) for row in manifest.rows())
+    if column != "arch":
+        assert run_here("sweep", "sweep.toml", "-o", "d", "--resume", "--count", 12, "-q").status == 1
+        assert {getattr(row, column) for row in Manifest(Path("d")).rows()} == {now}
+
+
+@pytest.mark.usefixtures("made_workers")
+def test_a_merge_that_was_killed_goes_on() -> None:
+    """At any of its syncs of a file or directory; what is left is known as not whole, and other parts cannot go on."""
+    parts = [make_dataset(f"part{i}", (i, 2)) for i in (1, 2)]
+    merge(parts, Path("whole"))
+    expected, other = contents(Path("whole")), make_dataset("other", count=6)
+    for killed in range(0, 100, 4):
+        shutil.rmtree("d", ignore_errors=True)
+        if not (child := os.fork()):
+            syncs = 0
+
+            def sync(_: int, last: int = killed) -> None:
+                nonlocal syncs
+                syncs += 1
+                if syncs > last:
+                    os._exit(9)
+
+            os.fsync = sync
+            merge(parts, Path("d"))
+            os._exit(0)
+        if os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0:
+            break
+        if (Path("d") / "manifest.sqlite").exists():
+            status = status_of(Path("d"))
+            there = len(list(Path("d/shards").glob("*.h5")))
+            assert (status.accepted == 10) == (there == 4 and len(status.rows) == 12)
+            with pytest.raises(InputError, match="holds another dataset"):
+                merge([other], Path("d"))
+        merge(parts, Path("d"))
+        assert contents(Path("d")) == expected and told(Path("d")) == told(Path("whole"))
+        with pytest.raises(InputError, match="exists and is not empty"):
+            merge(parts, Path("d"))
+    assert killed > 10
 
 
 def test_a_dataset_that_is_being_written_is_refused(tmp_path: Path) -> None:
@@ -386,6 +436,122 @@ def test_keys_of_the_base_are_set_and_a_dataset_is_replaced(tmp_path: Path) -> N
     assert bad.status == 2 and 'did you mean "frames"' in bad.stderr and not (tmp_path / "e").exists()
 
 
+@pytest.mark.parametrize("name", ["one%20way", "100%", "a?mode=memory", "#1", "one way"])
+@pytest.mark.usefixtures("made_workers")
+def test_the_rows_are_those_of_the_path_that_is_given(name: str) -> None:
+    """Whatever a URI would read in it, beside a dataset whose name is what it would read."""
+    if name != "one way":
+        make_dataset("one way/d", count=3)
+    dataset = make_dataset(f"{name}/d", count=9)
+    assert status_of(dataset).expected == len(Manifest(dataset).rows()) == 9
+    outcome = run_here("dataset", "verify", dataset, "--json")
+    assert outcome.status == 0 and json.loads(outcome.stdout)["trajectories"] == 9
+
+
+def test_a_path_that_is_not_utf_8_gets_a_sentence(tmp_path: Path) -> None:
+    """As an option or an argument; nothing is written."""
+    sweep, bad = write_sweep(tmp_path), Path(os.fsdecode(bytes(tmp_path / "caf") + b"\xe9"))
+    bad.mkdir()
+    for words in (
+        ("sweep", sweep, "-o", bad / "d"),
+        ("dataset", "status", bad),
+        ("info", bad),
+        ("check", bad / "s.toml"),
+    ):
+        outcome = run_here(*words)
+        assert outcome.status == 2 and "is not UTF-8" in outcome.stderr and outcome.stderr.count("\n") == 1, outcome
+    assert list(bad.iterdir()) == []
+
+
+def files_of(directory: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(directory)): path.read_bytes() for path in directory.rglob("*") if path.is_file()}
+
+
+@pytest.mark.usefixtures("made_workers")
+def test_nothing_is_removed_before_all_is_known_to_be_right(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither a dataset nor what lies beside it, where a scheduler, a part, the disk or a file is not as needed."""
+    dataset = make_dataset("d")
+    (dataset / "notes.txt").write_text("mine", encoding="utf-8")
+    (dataset / "mine.toml").write_text(Path("sweep.toml").read_text(encoding="utf-8"), encoding="utf-8")
+    before = files_of(dataset)
+
+    def refused(sweep: object, *words: object) -> str:
+        outcome = run_here("sweep", sweep, "-o", "d", "--overwrite", *words)
+        assert outcome.status == 2 and files_of(dataset) == before, outcome
+        return outcome.stderr
+
+    assert "no scheduler answers there" in refused("sweep.toml", "--scheduler", "tcp://127.0.0.1:1")
+    assert "--shard 900/901 is empty" in refused("sweep.toml", "--count", "12", "--shard", "900/901")
+    assert "d/base.toml is read by this sweep" in refused("d/mine.toml", "--count", "12", "--set", "time.frames=2")
+    with monkeypatch.context() as patch:
+        patch.setattr("mpmcli.dataset.sweep_run.shutil.disk_usage", lambda _: SimpleNamespace(free=5))
+        assert "but the dataset needs about" in refused("sweep.toml")
+    with take_lock(dataset):
+        before = files_of(dataset)
+        assert "is being written by" in refused("sweep.toml")
+    before.pop("run.lock")
+    text = Path("base.toml").read_text(encoding="utf-8")
+    moved = text.replace("ball = { center = [0.7, 0.2], radius = 0.1 }", 'points = { file = "no.csv", spacing = 0.02 }')
+    Path("base.toml").write_text(moved, encoding="utf-8")
+    assert "no.csv" in refused("sweep.toml")
+
+
+@pytest.mark.usefixtures("made_workers")
+def test_overwrite_removes_files_of_mpmcli_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Through a link and in the present directory, too; neither what the owner has written nor what the sweep reads."""
+    make_dataset("there")
+    Path("d").symlink_to("there", target_is_directory=True)
+    mine = ["notes.txt", "shards/notes.txt", "pending/000001.txt", "quarantine/seen.h5", "mine.toml"]
+    for name in mine:
+        (Path("d") / name).parent.mkdir(exist_ok=True)
+        (Path("d") / name).write_text(SWEEP.replace("1000", "6"), encoding="utf-8")
+    readme = Path("d/README.md")
+    readme.write_bytes(b"# Ours\r\n" + readme.read_bytes() + b"Cite us.\r\n")
+    for sweep, directory in (("sweep.toml", "d"), ("d/mine.toml", "d"), ("d/sweep.toml", "d"), ("mine.toml", ".")):
+        if directory == ".":
+            monkeypatch.chdir("d")
+        words = ("--count", 6) if sweep == "sweep.toml" else ()
+        outcome = run_here("sweep", sweep, "-o", directory, "--overwrite", "--quiet", *words)
+        assert outcome.status == 1, outcome.stderr
+        there = Path(directory)
+        found = files_of(there)
+        made = {"sweep.toml", "base.toml", "manifest.sqlite", "README.md", "quarantine/000004.h5"}
+        assert set(found) == {*mine, *made, "shards/00000.h5", "shards/00001.h5"}
+        assert all(found[name].decode() == SWEEP.replace("1000", "6") for name in mine)
+        assert found["README.md"].startswith(b"# Ours\r\n<!--") and found["README.md"].endswith(b"Cite us.\r\n")
+        assert verify(there).faults == () and len(open_dataset(there)) == 5
+
+
+@pytest.mark.usefixtures("made_workers")
+def test_an_interrupt_leaves_what_the_sweep_reads(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before its first trajectory, in the directory of the sweep file."""
+    make_dataset("d", count=6)
+    (Path("d") / "notes.txt").write_text("mine", encoding="utf-8")
+    kept = {
+        name: data for name, data in files_of(Path("d")).items() if name in ("sweep.toml", "base.toml", "notes.txt")
+    }
+    monkeypatch.setattr("mpmcli.cli.dataset.interrupt_came", lambda: True)
+    assert run_here("sweep", "d/sweep.toml", "-o", "d", "--overwrite").status == 130
+    assert files_of(Path("d")) == kept
+
+
+def test_a_copied_file_takes_no_place(of_points: Sweep) -> None:
+    """Of a file that the owner has put there, or has changed; the copy goes, but not where it is the file itself."""
+    settings = SweepSettings(Path("dataset"), workers=1)
+    with taken_folder(of_points, settings):
+        pass
+    again, copy = replace(settings, overwrite=True), Path("dataset/grains.csv")
+    with taken_folder(of_points, again):
+        assert copy.read_bytes() == Path("grains.csv").read_bytes()
+    own = load_sweep("dataset/sweep.toml", laws=parameter_models())
+    with taken_folder(own, again):
+        assert copy.read_bytes() == Path("grains.csv").read_bytes()
+    copy.write_text("x,y\n0.3,0.3\n", encoding="utf-8")
+    with pytest.raises(InputError, match=r"dataset/grains.csv would be replaced"), taken_folder(of_points, again):
+        pass
+    assert copy.read_text(encoding="utf-8") == "x,y\n0.3,0.3\n"
+
+
 def test_a_rehearsal_tells_draws_disk_and_time(truth: Path, tmp_path: Path) -> None:
     """Its bytes are those of the dataset, within what headers take, and its draws those that come."""
     outcome = run_here("sweep", write_sweep(tmp_path), "--dry-run", "--json", "-o", tmp_path / "d")
@@ -471,7 +637,7 @@ def test_a_dataset_goes_on_from_its_own_sweep(of_points: Sweep, monkeypatch: pyt
         assert folder.count == 3
     made = sorted(path.name for path in settings.directory.iterdir())
     assert "grains" in made
-    discard_beginning(settings.directory, [settings.directory])
+    discard_beginning(sweep, settings.directory, [settings.directory])
     assert not settings.directory.exists()
 
 

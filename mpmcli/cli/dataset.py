@@ -44,7 +44,6 @@ def sweep_command(
     sweep: Path,
     count: int | None,
     overrides: tuple[str, ...],
-    overwrite: bool,
     dry_run: bool,
     max_time: float | None,
     quiet: bool,
@@ -60,7 +59,7 @@ def sweep_command(
     from mpmcli.cli.progress import ProgressBar
     from mpmcli.dataset.report import status_of
     from mpmcli.dataset.sweep_file import load_sweep
-    from mpmcli.dataset.sweep_run import SweepSettings, SweepState, discard, discard_beginning, rehearse, run_sweep
+    from mpmcli.dataset.sweep_run import SweepSettings, SweepState, discard_beginning, rehearse, run_sweep
     from mpmcli.materials.registry import load_plugins
     from mpmcli.plain_text import duration_text
 
@@ -68,14 +67,12 @@ def sweep_command(
     loaded = load_sweep(sweep, laws=load_plugins(given["plugins"]), count=count, overrides=overrides)
     directory = given["directory"] = given["directory"] or Path("datasets") / sweep.stem
     settings = SweepSettings(**given)
-    if overwrite and settings.resume:
+    if settings.overwrite and settings.resume:
         raise InputError("--resume keeps an earlier dataset, and --overwrite removes it: give one of them.")
     if dry_run:
         rehearsal = rehearse(loaded, settings)
         print_answer(rehearsal, as_json)
         return 0 if rehearsal.passes else 1
-    if overwrite:
-        discard(directory)
     made = [path for path in (directory, *directory.parents) if not path.exists()][::-1]
     with ProgressBar(loaded.count, "trajectories", quiet=quiet) as bar, interrupts_wait():
 
@@ -88,7 +85,7 @@ def sweep_command(
 
         state = run_sweep(loaded, settings, show, lambda: interrupt_came() or time.monotonic() > end)
     if interrupt_came() and not state.done and not settings.resume:
-        discard_beginning(directory, made)
+        discard_beginning(loaded, directory, made)
         raise KeyboardInterrupt
     stopped = state.status == "interrupted" and not interrupt_came()
     if stopped:

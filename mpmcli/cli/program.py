@@ -13,7 +13,7 @@ from mpmcli import __version__
 from mpmcli.cli.interrupt import catch_interrupts, interrupt_came, interrupted_code
 from mpmcli.cli.streams import flush_streams, print_error
 from mpmcli.cli.supervisor import may_supervise, supervise
-from mpmcli.errors import MpmcliError
+from mpmcli.errors import InputError, MpmcliError
 
 # Name of each command, the module with its NAME_command, and its help line, so that help loads no modules.
 COMMANDS = {
@@ -107,6 +107,9 @@ def run(arguments: list[str]) -> int:
     # Also accepted after the command.
     arguments = (["--debug"] if debug else []) + [word for word in arguments if word != "--debug"]
     try:
+        for word in arguments:
+            if any("\ud800" <= letter <= "\udfff" for letter in word):
+                raise InputError(f"{os.fsencode(word)!r} is not UTF-8: rename the file or directory.")
         result = program.main(arguments, prog_name="mpmcli", standalone_mode=False)
         return result if isinstance(result, int) else 0
     except click.ClickException as error:

@@ -68,7 +68,7 @@ def simulate_command(scene: Path, precision: str | None, quiet: bool, as_json: b
     limits = Limits(run.pop("max_time"), run.pop("max_memory"))
     run["directory"] = run["directory"] or Path("results") / scene.stem
     settings = RunSettings(**run, limits=limits, command=["mpmcli", *sys.argv[1:]])
-    announce(settings.directory)
+    announce(settings.directory, loaded.inputs)
     progress = SimulateProgress(loaded.scene.time.end, loaded.scene.time.frames + 1, quiet=quiet)
     with progress, interrupts_wait():
         summary = simulate(loaded, settings, progress.start, progress.advance, interrupt_came)

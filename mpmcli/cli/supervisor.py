@@ -12,7 +12,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -74,13 +74,14 @@ def supervise(work: Callable[[], int]) -> int:
     return _attend(child, requests, watched, told)
 
 
-def announce(directory: Path) -> None:
-    """Tell the supervisor which result this process is about to write, so that it can close it after a kill."""
+def announce(directory: Path, inputs: Iterable[Path]) -> None:
+    """Tell the supervisor which result this process is about to write from files, to close it after a kill."""
     if _announced is None:
         return
     place = directory.absolute()
     made = [str(path) for path in (place, *place.parents) if not path.exists()]
-    os.write(_announced, json.dumps({"directory": str(place), "made": made[::-1]}).encode() + b"\n")
+    facts = {"directory": str(place), "made": made[::-1], "inputs": [str(path) for path in inputs]}
+    os.write(_announced, json.dumps(facts).encode() + b"\n")
 
 
 def _attend(child: int, requests: set[signal.Signals], watched: set[signal.Signals], told: int) -> int:
@@ -162,6 +163,7 @@ def _interrupted(child: int, told: int, first: signal.Signals) -> int:
             from mpmcli.output.directory import close_abandoned
 
             facts = json.loads(lines[-1])
-            close_abandoned(Path(facts["directory"]), [Path(path) for path in facts["made"]], child, first.name)
+            made, inputs = ([Path(path) for path in facts[name]] for name in ("made", "inputs"))
+            close_abandoned(Path(facts["directory"]), made, inputs, child, first.name)
     print_error("interrupted")
     return INTERRUPTED if first == signal.SIGINT else TERMINATED

@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from mpmcli.dataset.folder import MANIFEST
+from mpmcli.dataset.report import MOST_NAMED, status_of
 from mpmcli.dataset.shard import LABELS, MOVING, SHARDS, SPLITS, SWEEP, TABLES, StoredGroup, moving_names, open_shard
 from mpmcli.errors import InputError
 from mpmcli.frames.frame import Frame
@@ -16,6 +18,7 @@ from mpmcli.output.collider_files import as_they_moved
 from mpmcli.output.header import RunHeader
 from mpmcli.output.layout import PACKED, SEGMENTS, FrameLayout
 from mpmcli.output.run_record import RECORD
+from mpmcli.plain_text import counted
 from mpmcli.scene.colliders import Collider
 
 Particles = slice | np.ndarray
@@ -196,14 +199,26 @@ class Dataset:
     Attributes:
         path: path as given. numbers: numbers of the trajectories, ascending.
         splits: the numbers of each split, by "train", "valid" and "test".
+        missing: numbers that the manifest neither excludes nor the shards hold.
     """
 
-    def __init__(self, path: Path, splits: dict[int, str], source: dict[int, Path] | Result) -> None:
-        self.path = path
+    def __init__(
+        self, path: Path, splits: dict[int, str], source: dict[int, Path] | Result, missing: tuple[int, ...] = ()
+    ) -> None:
+        self.path, self.missing = path, missing
         self.numbers = tuple(sorted(splits))
         self.splits = {split: tuple(n for n in self.numbers if splits[n] == split) for split in SPLITS}
         self._known = frozenset(splits)
         self._source = source
+
+    @property
+    def lack(self) -> str:
+        """A sentence that names the missing trajectories, "" if there are none."""
+        if not self.missing:
+            return ""
+        named = ", ".join(map(str, self.missing[:MOST_NAMED])) + ", ..." * (len(self.missing) > MOST_NAMED)
+        count = counted(len(self.missing), "trajectory")
+        return f"{self.path} lacks {count} of its sweep ({named}): mpmcli sweep --resume computes them."
 
     def __len__(self) -> int:
         return len(self.numbers)
@@ -260,4 +275,9 @@ def open_dataset(path: Path | str) -> Dataset:
         places |= dict.fromkeys(found, shard)
     if not splits:
         raise InputError(f"{path} is an empty dataset: it holds no trajectory yet.")
-    return Dataset(path, splits, places)
+    missing: tuple[int, ...] = ()
+    if (path / MANIFEST).exists():
+        status = status_of(path)
+        lost = {row.number for row in status.rows if row.accepted} - splits.keys()
+        missing = tuple(sorted({*status.waiting, *lost}))
+    return Dataset(path, splits, places, missing)

@@ -92,6 +92,7 @@ def export(
     failed.
     """
     directory = Path(settings.directory)
+    _restore_former(directory)
     check_export_directory(directory, settings.overwrite)
     numbers: Sequence[int] = dataset.numbers if settings.trajectory is None else [settings.trajectory]
     options = (settings.stride, settings.max_particles, settings.walls, settings.wall_spacing)
@@ -157,6 +158,17 @@ def check_export_directory(directory: Path, overwrite: bool) -> None:
     if names and (foreign or EXPORTED_BY not in _metadata(directory)):
         what = f"it holds {foreign[0]}" if foreign else f"it has no {METADATA} of mpmcli export"
         raise InputError(f"{directory} is not an earlier export, as {what}: give another directory with -o.")
+
+
+def _restore_former(directory: Path) -> None:
+    """Give an export its name again that a killed one had set aside, or remove it if another has the name."""
+    target = directory.resolve()
+    former = re.compile(rf"{re.escape(target.name)}\.\d+\.old{re.escape(TEMPORARY_SUFFIX)}")
+    for path in target.parent.iterdir() if target.parent.is_dir() else ():
+        if former.fullmatch(path.name) and target.exists():
+            shutil.rmtree(path, ignore_errors=True)
+        elif former.fullmatch(path.name):
+            os.rename(path, target)
 
 
 @contextmanager

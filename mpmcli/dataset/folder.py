@@ -10,7 +10,7 @@ import sqlite3
 import tomllib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import astuple, dataclass, fields, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -24,9 +24,9 @@ from mpmcli.check.finding import Verdict
 from mpmcli.dataset.shard import BASE, PENDING, QUARANTINE, SHARDS, SWEEP, checksum, group_name, join_trajectories
 from mpmcli.dataset.sweep import Sweep
 from mpmcli.errors import InputError, RunError
-from mpmcli.output.checksums import checksum_is_right, first_line, path_digest, require_format
+from mpmcli.output.checksums import first_line, path_digest, require_format
 from mpmcli.output.directory import check_directory
-from mpmcli.output.durable import require_free_space, sealed
+from mpmcli.output.durable import TEMPORARY_SUFFIX, require_free_space, sealed
 from mpmcli.output.lock import LOCK
 from mpmcli.scene.toml_file import key_parts
 
@@ -74,7 +74,12 @@ class Row:
         """Return the row of a failed trajectory without further facts."""
         values: dict[str, Any] = {f.name: f.type() for f in fields(cls)}
         values |= {"number": number, "split": split, "draws": "{}", "verdict": "failed", "reason": reason}
-        return cls(**{**values, "version": __version__, "taichi": version("taichi")})
+        return cls(**{**values, **program()})
+
+
+def program() -> dict[str, str]:
+    """Return the versions of mpmcli and Taichi, on which the bytes of a trajectory depend."""
+    return {"version": __version__, "taichi": version("taichi")}
 
 
 class _SweepFacts(BaseModel):
@@ -88,6 +93,8 @@ class _SweepFacts(BaseModel):
     part: list[int] = Field(min_length=2, max_length=2)
 
 
+# Columns on which the bytes of a trajectory depend, in words.
+PROGRAM = {"version": "mpmcli", "taichi": "Taichi", "arch": "--arch"}
 _ROWS = TypeAdapter(list[Row])
 _COLUMNS = ", ".join(f.name for f in fields(Row))
 _TYPES = {int: "INTEGER", float: "REAL", str: "TEXT"}
@@ -146,7 +153,7 @@ class Manifest:
             raise InputError(f"{self.path.parent} is not a dataset: it has no {MANIFEST}.")
         try:
             # Not mode=ro, which cannot roll back the changes of a killed writer.
-            with closing(sqlite3.connect(f"file:{self.path}?mode=rw", uri=True)) as connection:
+            with closing(sqlite3.connect(f"{self.path.absolute().as_uri()}?mode=rw", uri=True)) as connection:
                 yield connection
         except (sqlite3.Error, ValueError) as error:
             what = first_line(error)
@@ -158,6 +165,24 @@ def require_empty(directory: Path, *, locked: bool = False) -> None:
     if directory.is_dir() and any(path.name != LOCK for path in directory.iterdir()):
         raise InputError(f"{directory} exists and is not empty: give another directory with -o.")
     check_directory(directory, overwrite=False, locked=locked)
+
+
+def require_same_program(place: Path, found: Iterable[Mapping[str, Any]], now: Mapping[str, str]) -> None:
+    """Refuse trajectories of another version of mpmcli or Taichi or backend than `now`, by column; "auto" is any."""
+    for before in found:
+        for name, value in now.items():
+            if value not in ("auto", before.get(name, value)):
+                raise InputError(
+                    f"{place} holds trajectories computed with {PROGRAM[name]} {before[name]}; those of {value} would "
+                    "differ: compute all of them with one."
+                )
+
+
+def is_beginning(directory: Path) -> bool:
+    """Return whether a directory holds what a process leaves that is killed before its dataset has a manifest."""
+    names = [path.name for path in directory.iterdir()] if directory.is_dir() else [MANIFEST]
+    done = {name.removesuffix("-journal").removesuffix(TEMPORARY_SUFFIX) for name in names}
+    return MANIFEST not in names and done <= {SWEEP, BASE, MANIFEST, LOCK}
 
 
 class Folder:
@@ -192,16 +217,6 @@ class Folder:
     def shard_file(self, shard: int) -> str:
         """Return the path of a shard in the dataset."""
         return f"{SHARDS}/{shard:05d}.h5"
-
-    def is_kept(self, row: Row) -> bool:
-        """Return whether a row is final: its frames are in its file.
-
-        A failed trajectory is tried again, and so is one whose single file is damaged and cannot enter a shard.
-        """
-        path = self.path / row.file
-        if row.verdict == "failed" or not row.file:
-            return row.verdict != "failed"
-        return path.is_file() and (row.file.startswith(f"{SHARDS}/") or checksum_is_right(path))
 
     def seal(self, shard: int, rows: Mapping[int, Row]) -> list[Row]:
         """Join accepted trajectories to a shard durably, return changed rows; RunError: the single files are kept."""
@@ -266,7 +281,8 @@ def copy_sources(names: Iterable[str], origin: Path, directory: Path) -> None:
     for name in copied_files(names):
         if (origin / name).is_file():
             (directory / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(origin / name, directory / name)
+            with suppress(shutil.SameFileError):
+                shutil.copyfile(origin / name, directory / name)
 
 
 def standing_alone(sweep: Sweep) -> str:

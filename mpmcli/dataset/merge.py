@@ -3,9 +3,18 @@
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
-from mpmcli.dataset.folder import Manifest, copy_sources, require_empty
-from mpmcli.dataset.report import Status, status_of, verify, write_card
+from mpmcli.dataset.folder import (
+    PROGRAM,
+    Manifest,
+    Row,
+    copy_sources,
+    is_beginning,
+    require_empty,
+    require_same_program,
+)
+from mpmcli.dataset.report import CARD, Status, status_of, verify, write_card
 from mpmcli.dataset.shard import BASE, QUARANTINE, SHARDS, SWEEP
 from mpmcli.errors import InputError, RunError
 from mpmcli.output.durable import require_free_space, sealed, write_text
@@ -13,10 +22,16 @@ from mpmcli.output.lock import take_lock
 
 
 def merge(parts: Sequence[Path], target: Path) -> Status:
-    """Merge complete parts of one sweep into one dataset; InputError, nothing written: a part is unsuitable."""
-    require_empty(target)
+    """Merge complete parts of one sweep into one dataset, or go on with a merge of the same parts that was killed.
+
+    InputError, nothing written: a part or the target is unsuitable.
+    """
     facts = [Manifest(part).facts() for part in parts]
+    rows = [row for part in parts for row in Manifest(part).rows()]
+    first = next((vars(row) for row in rows if row.verdict != "failed"), facts[0])
     for part, its in zip(parts, facts, strict=True):
+        done = [vars(row) for row in Manifest(part).rows() if row.verdict != "failed"]
+        require_same_program(part, [its, *done], {name: first[name] for name in PROGRAM if name in first})
         if {**its, "part": None} != {**facts[0], "part": None}:
             raise InputError(f"{part} has another sweep, other files or another version of mpmcli than {parts[0]}.")
     count = facts[0]["part"][1]
@@ -31,16 +46,26 @@ def merge(parts: Sequence[Path], target: Path) -> Status:
     for part in parts:
         if faults := verify(part).faults:
             raise InputError(f"{part} cannot be merged: {faults[0]}")
-    files = [file for part in parts for folder in (SHARDS, QUARANTINE) for file in sorted((part / folder).glob("*.h5"))]
+    manifest, told = Manifest(target), {**facts[0], "part": [1, 1]}
+    files = [
+        file
+        for part in parts
+        for folder in (SHARDS, QUARANTINE)
+        for file in sorted((part / folder).glob("*.h5"))
+        if not (target / folder / file.name).exists()
+    ]
+    if manifest.path.exists() and not files and (target / CARD).exists():
+        require_empty(target)
+    _require_target(manifest, told, rows)
     target.mkdir(parents=True, exist_ok=True)
     with take_lock(target):
-        require_empty(target, locked=True)
+        _require_target(manifest, told, rows, locked=True)
         size = sum(file.stat().st_size for file in files)
         require_free_space(target, size, "the merged dataset", "the parts are kept", several=True)
         # The manifest comes first, so that a killed merge is recognised by the files that it lacks.
-        manifest = Manifest(target)
-        manifest.create({**facts[0], "part": [1, 1]})
-        manifest.put(row for part in parts for row in Manifest(part).rows())
+        if not manifest.path.exists():
+            manifest.create(told)
+        manifest.put(rows)
         try:
             for file in files:
                 copy = target / file.parent.name / file.name
@@ -54,3 +79,12 @@ def merge(parts: Sequence[Path], target: Path) -> Status:
             raise RunError(f"{target} could not be written ({error.strerror}); the parts are kept.") from error
         write_card(target)
     return status_of(target)
+
+
+def _require_target(manifest: Manifest, facts: dict[str, Any], rows: Sequence[Row], *, locked: bool = False) -> None:
+    """Refuse a directory that is neither empty nor holds a part of the merged dataset."""
+    target = manifest.path.parent
+    if not manifest.path.exists() and not is_beginning(target):
+        require_empty(target, locked=locked)
+    elif manifest.path.exists() and not (manifest.facts() == facts and {*manifest.rows()} <= {*rows}):
+        raise InputError(f"{target} holds another dataset: give another directory with -o.")

@@ -39,7 +39,8 @@ def plan_montage(path: Path, request: Request) -> RenderPlan:
     # No empty cells, except in the last row.
     columns = min(columns, len(numbers))
     grid, output = f"{columns}x{-(-len(numbers) // columns)}", request.output or path / MONTAGE
-    return plan_render(cells, replace(request, frames=None, montage=grid, output=output), cells.captions)
+    plan = plan_render(cells, replace(request, frames=None, montage=grid, output=output), cells.captions)
+    return replace(plan, notes=(dataset.lack,) if dataset.lack else ())
 
 
 class TrajectoryCells(Result):

@@ -5,6 +5,7 @@ Also its card, README.md in its directory: distributions, contents, and code tha
 
 import json
 import math
+import re
 import tomllib
 from array import array
 from collections import Counter
@@ -30,8 +31,9 @@ from mpmcli.dataset.shard import (
 )
 from mpmcli.errors import InputError, RunError
 from mpmcli.output.checksums import checksum_is_right
-from mpmcli.output.durable import write_text
+from mpmcli.output.durable import sealed
 from mpmcli.plain_text import counted, markdown_table, one_line, size_text
+from mpmcli.render.picture_file import digest_of
 
 # Largest number of trajectories named in a text.
 MOST_NAMED = 10
@@ -39,17 +41,27 @@ MOST_NAMED = 10
 
 @dataclass(frozen=True)
 class Status:
-    """Counts of a dataset with `part` (i, n) of a sweep: `expected` trajectories, and `rows` of those tried."""
+    """Counts of a dataset with `part` (i, n) of a sweep: `expected` trajectories, and `rows` of those tried.
+
+    `missing` files of trajectories do not exist; trajectories with the numbers `waiting` have not been tried.
+    """
 
     path: Path
     part: tuple[int, int]
     expected: int
     rows: tuple[Row, ...]
+    missing: frozenset[str] = frozenset()
+    waiting: frozenset[int] = frozenset()
 
     @property
     def accepted(self) -> int:
         """Trajectories that the dataset includes."""
-        return sum(row.accepted for row in self.rows)
+        return sum(row.accepted for row in self.rows if row.file not in self.missing)
+
+    @property
+    def absent(self) -> list[int]:
+        """Numbers of the trajectories without their file."""
+        return [row.number for row in self.rows if row.file in self.missing]
 
     def as_dict(self) -> dict:
         """Return the counts, and the reason of each trajectory that is not included."""
@@ -61,6 +73,7 @@ class Status:
             "part": list(self.part),
             "trajectories": self.expected,
             "done": len(self.rows),
+            "missing": self.absent,
             "accepted": self.accepted,
             "retried": sum(row.retries > 0 for row in self.rows),
             "verdicts": {verdict: verdicts[verdict] for verdict in VERDICTS},
@@ -73,7 +86,8 @@ class Status:
     def lack(self) -> str:
         """Return the part of the sweep that the dataset lacks, apart from exclusions by verdict, "" if none."""
         failed, waiting = sum(row.verdict == "failed" for row in self.rows), self.expected - len(self.rows)
-        told = [f"{n} {what}" for n, what in ((waiting, "not computed"), (failed, "failed")) if n]
+        counts = ((waiting, "not computed"), (failed, "failed"), (len(self.absent), "without their file"))
+        told = [f"{n} {what}" for n, what in counts if n]
         (i, n), of = self.part, counted(self.expected, "trajectory")
         if n > 1:
             told.append(f"this is part {i} of {n} of the sweep")
@@ -86,6 +100,7 @@ class Status:
             f"{self.path}: {self.accepted} of {counted(self.expected, 'trajectory')} included, "
             f"{self.expected - len(self.rows)} to compute, {told['retried']} retried"
         ]
+        lines += [f"  {name} is missing" for name in sorted(self.missing)]
         lines += [f"  {verdict:<9} {count}" for verdict, count in told["verdicts"].items() if count]
         lines += [f"  {split:<9} {count}" for split, count in told["splits"].items()]
         excluded = told["excluded"]
@@ -100,7 +115,9 @@ def status_of(path: Path) -> Status:
     manifest = Manifest(path)
     facts, rows = manifest.facts(), manifest.rows()
     folder = Folder(path, facts["count"], facts["per_shard"], tuple(facts["part"]))
-    return Status(path, folder.part, folder.expected, tuple(rows))
+    missing = frozenset(name for name in {row.file for row in rows} if name and not (path / name).is_file())
+    waiting = frozenset(folder.all_numbers()) - {row.number for row in rows}
+    return Status(path, folder.part, folder.expected, tuple(rows), missing, waiting)
 
 
 @dataclass(frozen=True)
@@ -129,18 +146,30 @@ def verify(path: Path, on_file: Callable[[int, int], None] = lambda done, total:
     missing = status.expected - len(status.rows)
     if missing:
         faults.append(f"{counted(missing, 'trajectory')} not computed; mpmcli sweep --resume goes on.")
-    by_file: dict[str, list[Row]] = {}
-    for row in status.rows:
-        if row.file:
-            by_file.setdefault(row.file, []).append(row)
-        elif row.accepted:
-            faults.append(f"trajectory {row.number} is included, but has no file.")
+    by_file = _by_file(status.rows)
+    faults += [
+        f"trajectory {row.number} is included, but has no file." for row in status.rows if row.accepted and not row.file
+    ]
     others = set((path / SHARDS).glob("*.h5")) - {path / name for name in by_file}
     faults += [f"{other} is in no row of the manifest." for other in sorted(others)]
     for done, (name, rows) in enumerate(sorted(by_file.items()), 1):
         faults += _faults_of(path / name, rows)
         on_file(done, len(by_file))
     return Verification(path, sum(len(rows) for rows in by_file.values()), tuple(faults))
+
+
+def final_rows(path: Path, rows: Sequence[Row]) -> list[Row]:
+    """Return the rows that are not computed again: neither failed, nor with a file that is missing or damaged."""
+    faulty = {name for name, its in _by_file(rows).items() if _faults_of(path / name, its)}
+    return [row for row in rows if row.verdict != "failed" and row.file not in faulty]
+
+
+def _by_file(rows: Sequence[Row]) -> dict[str, list[Row]]:
+    found: dict[str, list[Row]] = {}
+    for row in rows:
+        if row.file:
+            found.setdefault(row.file, []).append(row)
+    return found
 
 
 def _faults_of(file: Path, rows: list[Row]) -> list[str]:
@@ -180,6 +209,9 @@ def _trajectory_faults(file: h5py.File, row: Row) -> list[str]:
 
 
 CARD, MONTAGE = "README.md", "montage.png"
+# Marks around the card in README.md, whose other text is its owner's; a part without its end mark is the owner's, too.
+MARKS = b"<!-- card: written by mpmcli -->", b"<!-- end of card -->"
+_MARKED = re.compile(rb"(?s)%b((?!%b).)*?%b\n?" % (MARKS[0], MARKS[0], MARKS[1]))
 # Bins of a histogram; if there are few distinct values, each is counted separately.
 BINS = 10
 MOST_COUNTED = 6
@@ -191,7 +223,7 @@ def write_card(directory: Path) -> Path:
     """Write the card of a dataset whose trajectories have all been tried, and return its path.
 
     Its bytes depend on the sweep and the trajectories alone, not on times, machines, interrupts or parts. It shows the
-    picture montage.png if the directory contains one.
+    picture montage.png if the directory contains one. Other text in the file is kept.
     """
     manifest = Manifest(directory)
     facts, rows = manifest.facts(), manifest.rows()
@@ -216,10 +248,29 @@ def write_card(directory: Path) -> Path:
         "the sweep and its base scene.",
     ]
     try:
-        write_text(directory / CARD, "\n\n".join(section for section in sections if section) + "\n")
+        _put_card(directory / CARD, "\n\n".join(section for section in sections if section).encode())
     except OSError as error:
         raise RunError(f"{directory / CARD} could not be written ({error.strerror}); the dataset is kept.") from error
     return directory / CARD
+
+
+def _put_card(path: Path, card: bytes) -> None:
+    """Put a card between its marks, or after all other text."""
+    before, marked = path.read_bytes() if path.exists() else b"", b"\n\n".join([MARKS[0], card, MARKS[1]]) + b"\n"
+    text, found = _MARKED.subn(lambda _: marked, before)
+    with sealed(path) as temporary:
+        temporary.write_bytes(text if found else b"\n".join(filter(None, [before, marked])))
+
+
+def remove_card(directory: Path) -> None:
+    """Remove the card of a dataset, and its picture if mpmcli has drawn it; README.md stays if it has other text."""
+    path = directory / CARD
+    if path.exists() and _MARKED.sub(b"", path.read_bytes()).strip():
+        _put_card(path, b"")
+    else:
+        path.unlink(missing_ok=True)
+    if digest_of(directory / MONTAGE):
+        (directory / MONTAGE).unlink()
 
 
 def first_paragraph(text: str) -> str:

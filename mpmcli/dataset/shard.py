@@ -12,6 +12,7 @@ The last bytes of the file are a checksum of all bytes before them (`output/chec
 """
 
 import json
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -46,6 +47,7 @@ LEDGER = "ledger"
 # The files of a dataset, and its directories.
 SWEEP, BASE = "sweep.toml", "base.toml"
 SHARDS, PENDING, QUARANTINE = "shards", "pending", "quarantine"
+NUMBERED = re.compile(r"\d{5,}\.h5")
 # Largest overhead of HDF5 for a data set and for a group, bytes.
 TABLE_BYTES, GROUP_BYTES = 1024, 16 * 1024
 # Bytes of a compressed chunk: the size of HDF5's cache of a data set.

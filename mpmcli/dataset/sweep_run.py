@@ -4,7 +4,7 @@ import math
 import shutil
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from mpmcli import __version__
 from mpmcli.check.facts import SceneFacts
 from mpmcli.check.forecast import expected_steps, layout_of, seconds_of_one
 from mpmcli.cores import available_cores
@@ -27,18 +26,21 @@ from mpmcli.dataset.folder import (
     Row,
     copied_files,
     copy_sources,
+    is_beginning,
+    program,
     require_empty,
+    require_same_program,
     source_digests,
     source_files,
     standing_alone,
 )
-from mpmcli.dataset.report import write_card
-from mpmcli.dataset.shard import BASE, LABELS, PENDING, SWEEP, file_name
+from mpmcli.dataset.report import final_rows, remove_card, write_card
+from mpmcli.dataset.shard import BASE, LABELS, NUMBERED, PENDING, QUARANTINE, SHARDS, SWEEP, file_name
 from mpmcli.dataset.sweep import Sweep
 from mpmcli.errors import InputError
 from mpmcli.materials.registry import load_plugins
 from mpmcli.output.checksums import path_digest
-from mpmcli.output.durable import SPACE_MARGIN, TEMPORARY_SUFFIX, write_text
+from mpmcli.output.durable import SPACE_MARGIN, remove_numbered, write_text
 from mpmcli.output.lock import LOCK, refuse_locked, take_lock
 from mpmcli.plain_text import counted, duration_text, size_text, text_table
 from mpmcli.scene import Scene, estimate_particles
@@ -64,7 +66,8 @@ class SweepSettings:
     """Settings of a sweep that are not part of its file.
 
     `workers` is the number of local processes, None for one per core, unless a Dask `scheduler` at an address has them;
-    `part` (i, n) is every n-th shard from the i-th on; arch and threads are for each worker.
+    `part` (i, n) is every n-th shard from the i-th on; `overwrite` replaces a dataset that is there; arch and threads
+    are for each worker.
     """
 
     directory: Path
@@ -72,6 +75,7 @@ class SweepSettings:
     scheduler: str = ""
     part: tuple[int, int] = (1, 1)
     resume: bool = False
+    overwrite: bool = False
     arch: Arch = "auto"
     threads: int | None = 1
     plugins: tuple[Path, ...] = ()
@@ -167,14 +171,19 @@ def open_folder(
                 f"{changed[0]} has changed since {directory} was begun, which cannot be resumed with it: put it back "
                 "as it was, or give another directory with -o."
             )
+        rows = [vars(row) for row in manifest.rows() if row.verdict != "failed"]
+        require_same_program(directory, [facts, *rows], {**program(), "arch": settings.arch})
         return Folder(directory, sweep.count, facts["per_shard"], settings.part), manifest
-    if (directory / MANIFEST).exists():
-        raise InputError(f"{directory} holds a dataset: --resume goes on with it, and -o gives another directory.")
-    there = [path.name.removesuffix(TEMPORARY_SUFFIX) for path in directory.iterdir()] if directory.is_dir() else [""]
-    # A sweep may have been killed here before it wrote a manifest.
-    begun = {name.removesuffix("-journal") for name in there} <= {SWEEP, BASE, MANIFEST, LOCK}
-    if not (settings.resume and begun):
+    replaces = settings.overwrite and directory.is_dir() and any(path.name != LOCK for path in directory.iterdir())
+    if replaces and not (directory / MANIFEST).exists():
+        raise InputError(f"{directory} holds no dataset, and --overwrite replaces nothing else.")
+    if not replaces and (directory / MANIFEST).exists():
+        raise InputError(f"{directory} holds a dataset: --resume goes on with it, and --overwrite replaces it.")
+    if not (replaces or (settings.resume and is_beginning(directory))):
         require_empty(directory)
+    earlier = manifest.facts().get("files", {}) if replaces else {}
+    texts, digests = {SWEEP: standing_alone(sweep), BASE: sweep.base_text}, source_digests(sweep, settings.plugins)
+    _spare_files(sweep, directory, texts, digests, earlier)
     size = _bytes_of_trajectories(sweep, settings)
     per_shard = _per_shard(size)
     folder = Folder(directory, sweep.count, per_shard, settings.part)
@@ -185,6 +194,8 @@ def open_folder(
     # While a shard is sealed, its trajectories are on disk twice.
     needed = size * folder.expected + SHARD_BYTES + SPACE_MARGIN
     free = shutil.disk_usage(next(p for p in (directory, *directory.resolve().parents) if p.exists())).free
+    if replaces:
+        free += sum(path.stat().st_size for name in (SHARDS, QUARANTINE) for path in (directory / name).glob("*.h5"))
     if needed > free:
         raise InputError(
             f"the disk of {directory} has {size_text(free)} left, but the dataset needs about {size_text(needed)}: "
@@ -192,40 +203,64 @@ def open_folder(
         )
     directory.mkdir(parents=True, exist_ok=True)
     take()
-    if not settings.resume:
+    if replaces:
+        # Last, because it cannot be undone; the manifest of the removed dataset stays until that of the new one comes.
+        _remove_trajectories(directory, earlier, _inputs(sweep))
+    elif not settings.resume:
         # Another sweep may have started and ended meanwhile.
         require_empty(directory, locked=True)
-    facts = {"key": sweep.key, "count": sweep.count, "seed": sweep.seed, "accept": sweep.accept}
-    facts["files"] = source_digests(sweep, settings.plugins)
-    write_text(directory / SWEEP, standing_alone(sweep))
-    write_text(directory / BASE, sweep.base_text)
-    manifest.create({**facts, "per_shard": per_shard, "part": list(settings.part), "version": __version__})
-    copy_sources(facts["files"], sweep.base.parent, directory)
+    facts = {"key": sweep.key, "count": sweep.count, "seed": sweep.seed, "accept": sweep.accept, "files": digests}
+    for name, text in texts.items():
+        write_text(directory / name, text)
+    manifest.create({**facts, "per_shard": per_shard, "part": list(settings.part), **program()})
+    copy_sources(digests, sweep.base.parent, directory)
     return folder, manifest
 
 
-def discard(directory: Path) -> None:
-    """Remove a dataset, if there is one; InputError: it is not a dataset, or another process writes it."""
-    if directory.is_dir() and any(directory.iterdir()):
-        if not (directory / MANIFEST).exists():
-            raise InputError(f"{directory} holds no dataset, and --overwrite replaces nothing else.")
-        refuse_locked(directory)
-        shutil.rmtree(directory)
+def _inputs(sweep: Sweep) -> set[Path]:
+    """Return the files that a sweep reads, which are neither changed nor removed."""
+    return {path.resolve() for path in (sweep.path, sweep.base, *source_files(sweep, ()).values())}
 
 
-def discard_beginning(directory: Path, made: Sequence[Path]) -> None:
-    """Remove a dataset without finished trajectories, and the directories `made` for it, outermost first."""
-    if not (directory / MANIFEST).exists() or Manifest(directory).rows():
-        return
-    with take_lock(directory):
-        shutil.rmtree(directory / PENDING, ignore_errors=True)
-        for name in copied_files(Manifest(directory).facts().get("files", ())):
-            (directory / name).unlink(missing_ok=True)
+def _spare_files(
+    sweep: Sweep, directory: Path, texts: Mapping[str, str], digests: Mapping[str, str], earlier: Mapping[str, str]
+) -> None:
+    """Refuse a directory with a file that the new dataset would change, other than copies of the `earlier` one."""
+    inputs = _inputs(sweep)
+    for name, text in texts.items():
+        path = directory / name
+        if path.resolve() in inputs and path.read_text(encoding="utf-8") != text:
+            raise InputError(f"{path} is read by this sweep, which would change it: give another directory with -o.")
+    for name in copied_files(digests):
+        path, known = directory / name, (earlier.get(name), digests[name])
+        if path.exists() and path.resolve() not in inputs and path_digest(path) not in known:
+            raise InputError(f"{path} would be replaced by a file of the sweep: give another directory with -o.")
+
+
+def _remove_trajectories(directory: Path, copied: Mapping[str, str], spared: Collection[Path]) -> None:
+    """Remove the files of a dataset but its manifest and sweep, and unchanged copies of files by name and digest."""
+    remove_card(directory)
+    for name in (PENDING, QUARANTINE, SHARDS):
+        remove_numbered(directory / name, NUMBERED)
+    for name in copied_files(copied):
+        path = directory / name
+        if path.is_file() and path.resolve() not in spared and path_digest(path) == copied[name]:
+            path.unlink()
             for parent in list(Path(name).parents)[:-1]:
                 with suppress(OSError):
                     (directory / parent).rmdir()
-        for name in (SWEEP, BASE, MANIFEST):
-            (directory / name).unlink(missing_ok=True)
+
+
+def discard_beginning(sweep: Sweep, directory: Path, made: Sequence[Path]) -> None:
+    """Remove a dataset without finished trajectories, and the directories `made` for it, outermost first."""
+    manifest, inputs = Manifest(directory), _inputs(sweep)
+    if not manifest.path.exists() or manifest.rows():
+        return
+    with take_lock(directory):
+        _remove_trajectories(directory, manifest.facts().get("files", {}), inputs)
+        for path in (directory / name for name in (SWEEP, BASE, MANIFEST)):
+            if path.resolve() not in inputs:
+                path.unlink(missing_ok=True)
     for path in reversed(made):
         with suppress(OSError):
             path.rmdir()
@@ -279,7 +314,7 @@ def run_sweep(
             run.compute_missing(joined, began, on_progress, stop)
             if settings.part == (1, 1):
                 write_card(settings.directory)
-            shutil.rmtree(settings.directory / PENDING, ignore_errors=True)
+            remove_numbered(settings.directory / PENDING, NUMBERED)
             run.state.status = "finished"
         except KeyboardInterrupt:
             run.state.status = "interrupted"
@@ -290,8 +325,11 @@ class _Run:
     """Enters rows into the manifest, and seals each shard after its last row."""
 
     def __init__(self, sweep: Sweep, settings: SweepSettings, folder: Folder, manifest: Manifest) -> None:
-        self.sweep, self.settings, self.folder, self.manifest = sweep, settings, folder, manifest
-        self.rows = {row.number: row for row in manifest.rows() if folder.is_kept(row)}
+        self.sweep, self.folder, self.manifest = sweep, folder, manifest
+        self.rows = {row.number: row for row in final_rows(folder.path, manifest.rows())}
+        # A dataset is computed on one backend, that of its first trajectories.
+        arch = next((row.arch for row in self.rows.values() if row.arch), settings.arch)
+        self.settings = replace(settings, arch=arch)
         self.state = SweepState(settings.directory, folder.expected, len(self.rows))
         for row in self.rows.values():
             self.state.count(row)

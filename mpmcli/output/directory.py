@@ -2,7 +2,7 @@
 
 import json
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +11,7 @@ from mpmcli.errors import InputError
 from mpmcli.output.checkpoints import CHECKPOINT_NAME, CHECKPOINTS
 from mpmcli.output.collider_files import MOVING, RESTING
 from mpmcli.output.durable import TEMPORARY_SUFFIX, remove_numbered, sync_directory, temporary_of, write_text
-from mpmcli.output.layout import DAMAGED, PACKED, remove_segments, sealed_segments
+from mpmcli.output.layout import DAMAGED, PACKED, SEGMENTS, remove_segments, sealed_segments
 from mpmcli.output.lock import LOCK, refuse_locked, refused, take_lock, time_now
 from mpmcli.output.run_record import RECORD, read_record
 from mpmcli.output.series import is_series_file
@@ -20,13 +20,18 @@ SCENE = "scene.toml"
 NAMES = (PACKED, DAMAGED, SCENE, RECORD, RESTING, MOVING)
 
 
-@dataclass(frozen=True)
+@dataclass
 class TakenDirectory:
-    """A directory locked by this process until `release`; `made` lists the directories created, outermost first."""
+    """A directory locked by this process until `release`; `made` lists the directories created, outermost first.
+
+    `spared` resolved paths are never removed; `replaces`: whether it holds an earlier result, which `clear` removes.
+    """
 
     path: Path
     lock: ExitStack
     made: tuple[Path, ...]
+    spared: frozenset[Path] = frozenset()
+    replaces: bool = False
 
     def __enter__(self) -> "TakenDirectory":
         return self
@@ -40,23 +45,30 @@ class TakenDirectory:
         """Release the lock; a second call does nothing."""
         self.lock.close()
 
-    def clear(self) -> None:
-        """Remove an earlier result; InputError: it cannot be removed."""
-        _remove_result(self.path)
+    def clear(self, first: Path | None = None) -> None:
+        """Remove an earlier result, but not the `first` file of a new one; InputError: it cannot be removed."""
+        _remove_result(self.path, {*self.spared, first and first.resolve()})
+        self.replaces = False
 
     def undo(self) -> None:
-        """Remove the files of a run that computed nothing, and the directories made for it."""
-        with suppress(OSError, InputError):
-            _remove_result(self.path)
+        """Remove the files of a run that computed nothing, and the directories made for it; an earlier result stays."""
+        if not self.replaces:
+            with suppress(OSError, InputError):
+                self.clear()
+        with suppress(OSError):
+            (self.path / SEGMENTS).rmdir()
         self.release()
         _unmake(self.made)
 
 
-def take_directory(directory: Path, overwrite: bool, *, resume: bool = False) -> TakenDirectory:
-    """Ensure that `directory` exists, is writable, has no earlier result, and is not being written; lock it.
+def take_directory(
+    directory: Path, overwrite: bool, *, resume: bool = False, inputs: Collection[Path] = ()
+) -> TakenDirectory:
+    """Ensure that `directory` exists, is writable, and is not being written; lock it.
 
-    With `overwrite` only the files that mpmcli writes are removed; with `resume` all stay. InputError, and nothing
-    changed: other files are in the way, another process writes it, or it cannot be written.
+    With `overwrite` it may hold an earlier result, which `clear` removes, except for resolved paths in `inputs`; with
+    `resume` all stays. InputError, and nothing changed: other files or an input of the run are in the way, another
+    process writes it, or it cannot be written.
     """
     directory = Path(directory)
     check_directory(directory, overwrite, resume=resume)
@@ -66,14 +78,16 @@ def take_directory(directory: Path, overwrite: bool, *, resume: bool = False) ->
         lock = take_lock(directory)
         # Another run may have started and ended meanwhile.
         check_directory(directory, overwrite, resume=resume, locked=True)
-        if not resume:
-            _remove_result(directory)
+        for path in [] if resume else _result_files(directory):
+            if path.resolve() in inputs and path.name != SCENE:
+                raise InputError(f"{path} is read by the scene, and the result would replace it: give another -o.")
     except BaseException:
         if lock is not None:
             lock.close()
         _unmake(made)
         raise
-    return TakenDirectory(directory, lock, tuple(made))
+    replaces = overwrite and any(path.name != LOCK for path in directory.iterdir())
+    return TakenDirectory(directory, lock, tuple(made), frozenset(inputs), replaces)
 
 
 def check_directory(directory: Path, overwrite: bool, *, resume: bool = False, locked: bool = False) -> None:
@@ -136,7 +150,8 @@ def _refuse_unwritable(directory: Path) -> None:
         raise refused(directory, "written", error) from error
 
 
-def _remove_result(directory: Path) -> None:
+def _result_files(directory: Path) -> list[Path]:
+    """Return the files of a result but its segments and checkpoints; InputError: they cannot be replaced."""
     names = {path: path.name.removesuffix(TEMPORARY_SUFFIX) for path in directory.iterdir()}
     ours = [path for path, name in names.items() if name in NAMES or is_series_file(name)]
     for path in ours:
@@ -145,8 +160,13 @@ def _remove_result(directory: Path) -> None:
     if (directory / SCENE).exists() and not (has_frames(directory) or read_record(directory) is not None):
         # With `-o .` it may be the scene that is about to run.
         raise InputError(f"{directory / SCENE} was not written by mpmcli: give another directory with -o.")
+    return ours
+
+
+def _remove_result(directory: Path, spared: Collection[Path | None]) -> None:
+    ours = [path for path in _result_files(directory) if path.resolve() not in spared]
     try:
-        remove_segments(directory)
+        remove_segments(directory, spared)
         remove_numbered(directory / CHECKPOINTS, CHECKPOINT_NAME)
         # The record is removed last: while it exists, the remaining files are known to be mpmcli's.
         for path in sorted(ours, key=lambda path: path.name == RECORD):
@@ -160,15 +180,15 @@ def has_frames(directory: Path) -> bool:
     return (directory / PACKED).exists() or bool(sealed_segments(directory))
 
 
-def close_abandoned(directory: Path, made: Sequence[Path], pid: int, signal: str) -> None:
+def close_abandoned(directory: Path, made: Sequence[Path], inputs: Collection[Path], pid: int, signal: str) -> None:
     """Close the result of a process `pid` that was killed by a signal: set "interrupted" in run.json.
 
-    Without a frame, the files of the run are removed, with the directories `made` for it, outermost first. A result of
-    another process is not changed.
+    Without a frame, the files of the run but its `inputs` are removed, with the directories `made` for it, outermost
+    first. A result of another process is not changed.
     """
     if not directory.is_dir():
         return
-    taken = TakenDirectory(directory, take_lock(directory), tuple(made))
+    taken = TakenDirectory(directory, take_lock(directory), tuple(made), frozenset(inputs))
     try:
         record = read_record(directory)
         process = (record or {}).get("process")

@@ -4,9 +4,10 @@ import errno
 import os
 import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from secrets import token_hex
 
 from mpmcli.errors import DiskFullError
 
@@ -50,9 +51,12 @@ def sync_directory(directory: Path) -> None:
 
 
 @contextmanager
-def sealed(path: Path, size: int = 0) -> Iterator[Path]:
-    """Yield a temporary path; on exit, move it to `path` durably. OSError: there is no space for `size` bytes."""
-    file = Unsealed(path)
+def sealed(path: Path, size: int = 0, *, unique: bool = False) -> Iterator[Path]:
+    """Yield a temporary path; on exit, move it to `path` durably. OSError: there is no space for `size` bytes.
+
+    It must be `unique` where no lock keeps other processes from writing the same file.
+    """
+    file = Unsealed(path, unique=unique)
     with file.written(size) as temporary:
         yield temporary
     file.seal()
@@ -61,13 +65,16 @@ def sealed(path: Path, size: int = 0) -> Iterator[Path]:
 class Unsealed:
     """A file that is first written, then moved to its path in one durable step, possibly by another thread."""
 
-    def __init__(self, path: Path) -> None:
-        self.path, self._temporary = path, temporary_of(path)
+    def __init__(self, path: Path, *, unique: bool = False) -> None:
+        self.path = path
+        self._temporary = temporary_of(path.with_name(f"{path.name}.{token_hex(4)}") if unique else path)
 
     @contextmanager
     def written(self, size: int = 0) -> Iterator[Path]:
         """Yield a temporary path to write and close; see `sealed`."""
         with self._removed_on_error():
+            # A killed process may have left one; a symbolic link must not be followed.
+            self._temporary.unlink(missing_ok=True)
             if size:
                 ask_for(self._temporary, size)
             yield self._temporary
@@ -104,9 +111,9 @@ def ask_for(path: Path, size: int) -> None:
         file.truncate(0)
 
 
-def write_text(path: Path, text: str) -> None:
-    """Replace a UTF-8 text file in one durable step."""
-    with sealed(path) as temporary:
+def write_text(path: Path, text: str, *, unique: bool = False) -> None:
+    """Replace a UTF-8 text file in one durable step; see `sealed`."""
+    with sealed(path, unique=unique) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="\n")
 
 
@@ -121,12 +128,12 @@ def numbered_files(folder: Path, names: re.Pattern[str]) -> list[Path]:
     return sorted(paths, key=number_of)
 
 
-def remove_numbered(folder: Path, names: re.Pattern[str]) -> None:
-    """Remove files with such names, also unfinished ones, and the folder unless it contains other files."""
+def remove_numbered(folder: Path, names: re.Pattern[str], spared: Collection[Path] = ()) -> None:
+    """Remove files with such names, also unfinished ones, but no `spared` resolved paths; and the folder, if empty."""
     if not folder.is_dir():
         return
     for path in folder.iterdir():
-        if names.fullmatch(path.name.removesuffix(TEMPORARY_SUFFIX)):
+        if names.fullmatch(path.name.removesuffix(TEMPORARY_SUFFIX)) and path.resolve() not in spared:
             path.unlink(missing_ok=True)
     with suppress(OSError):
         folder.rmdir()

@@ -7,7 +7,7 @@ segments during a run, and one packed file at its end.
 import csv
 import io
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -305,6 +305,6 @@ def sealed_segments(directory: Path) -> list[Path]:
     return numbered_files(directory / SEGMENTS, SEGMENT_NAME)
 
 
-def remove_segments(directory: Path) -> None:
-    """Remove sealed and unfinished segments, and their folder unless it contains other files."""
-    remove_numbered(directory / SEGMENTS, SEGMENT_NAME)
+def remove_segments(directory: Path, spared: Collection[Path] = ()) -> None:
+    """Remove sealed and unfinished segments but `spared` ones, and their folder unless it contains other files."""
+    remove_numbered(directory / SEGMENTS, SEGMENT_NAME, spared)

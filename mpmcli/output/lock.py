@@ -145,10 +145,13 @@ def take_lock(directory: Path) -> ExitStack:
     """
     path = Path(directory) / LOCK
     until = time.monotonic() + PATIENCE
+    flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_NOFOLLOW", 0)
     while True:
         try:
-            descriptor = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_CLOEXEC", 0), 0o644)
+            descriptor = os.open(path, flags, 0o644)
         except OSError as error:
+            if path.is_symlink():
+                raise InputError(f"{path} is a symbolic link, and mpmcli writes a file there: remove it.") from error
             raise refused(directory, "locked", error) from error
         try:
             got = _lock(descriptor, exclusive=True)

@@ -62,8 +62,13 @@ class SegmentStore:
         compress: bool = False,
         hold: float = 0.0,
         colliders: Sequence[Collider] | None = None,
+        replace_earlier: Callable[[Path], None] | None = None,
     ) -> None:
-        """Begin in a directory made by `take_directory`; write nothing before the first frame."""
+        """Begin in a directory made by `take_directory`; write nothing before the first frame.
+
+        `replace_earlier` removes an earlier result before the first new file, its argument, takes its name.
+        """
+        self._replace_earlier = replace_earlier
         self._colliders = RunHeader.read(header).colliders if colliders is None else tuple(colliders)
         self._directory = Path(directory)
         self.place = self._directory / SEGMENTS
@@ -104,7 +109,8 @@ class SegmentStore:
             raise ValueError(f"frame {frame.index} was given where frame {following} comes next")
         layout = FrameLayout.of(frame)
         if self._layout is None:
-            if (self._directory / PACKED).exists() or sealed_segments(self._directory):
+            there = (self._directory / PACKED).exists() or sealed_segments(self._directory)
+            if there and self._replace_earlier is None:
                 raise InputError(f"{self._directory} holds an earlier result: give another directory, or --overwrite.")
             self._layout = layout
             self._start()
@@ -225,6 +231,9 @@ class SegmentStore:
 
         # The function keeps no frame: the next ones are built meanwhile.
         def seal() -> None:
+            if self._replace_earlier is not None:
+                self._replace_earlier(temporary)
+                self._replace_earlier = None
             file.seal()
             self._sealed.add(file.path.name)
             self._counts += counts

@@ -79,7 +79,7 @@ def write_picture(path: Path, image: np.ndarray, digest: str) -> None:
     text.add_text(KEYWORD, digest)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with sealed(path) as temporary:
+        with sealed(path, unique=True) as temporary:
             Image.fromarray(image).save(temporary, format="png", compress_level=COMPRESS_LEVEL, pnginfo=text)
     except OSError as error:
         raise write_fault(path, error) from error
@@ -156,7 +156,7 @@ def write_film(
     width, height = _checked(pictures[0], None)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with sealed(path) as temporary, TemporaryDirectory() as directory:
+        with sealed(path, unique=True) as temporary, TemporaryDirectory() as directory:
             if path.suffix.lower() == ".mp4":
                 # Colours are stored for 2x2 pixels.
                 even = f"pad=iw+{width % 2}:ih+{height % 2},fillborders=right={width % 2}:bottom={height % 2},{BT709}"

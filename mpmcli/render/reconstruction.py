@@ -312,7 +312,7 @@ def _write_vtp(path: Path, mesh: Mesh, time: float) -> None:
         data.point_data["Normals"] = mesh.normals
         data.GetPointData().SetActiveNormals("Normals")
     data.field_data["TimeValue"] = np.array([time])
-    with sealed(path) as temporary:
+    with sealed(path, unique=True) as temporary:
         writer = vtk.vtkXMLPolyDataWriter()
         writer.SetFileName(str(temporary))
         writer.SetInputData(data)
@@ -331,4 +331,5 @@ def _write_obj(path: Path, mesh: Mesh, time: float) -> None:
         + lines("v %.9g %.9g %.9g\n", mesh.points)
         + lines("vn %.6g %.6g %.6g\n", mesh.normals)
         + lines("f %d//%d %d//%d %d//%d\n", corners),
+        unique=True,
     )

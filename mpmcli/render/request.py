@@ -96,6 +96,7 @@ class RenderPlan:
     ks: list[int]  # positions of the frames in the result
     plan: list[PlannedPicture]  # the picture files, one for each frame; one for a montage
     request: Request
+    notes: tuple[str, ...] = ()
 
     @property
     def due(self) -> int:
@@ -162,7 +163,7 @@ class RenderPlan:
             upto = "up to " if len(counts) > 1 and min(counts.values()) < most else ""
             return f"of {upto}{counted(most, 'particle')} is not a number, first in frame {first}"
 
-        warnings, colors = [], self.setup.colors
+        warnings, colors = [*self.notes], self.setup.colors
         missing = {k: missing for k, (missing, _) in outcomes.items() if missing}
         if missing and isinstance(colors, Coloring):
             warnings.append(f"the {colors.name} {first_of(missing)}: drawn in {colors.missing}")

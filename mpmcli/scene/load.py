@@ -89,6 +89,12 @@ class LoadedScene:
     notes: tuple[str, ...]
     source: str
 
+    @property
+    def inputs(self) -> set[File]:
+        """The scene's file and those of its shapes, as resolved paths."""
+        names = [name for entry in (*self.scene.sources, *self.scene.colliders) for name in entry.shape.files]
+        return {File(self.source).resolve(), *((File(self.source).parent / name).resolve() for name in names)}
+
 
 def load_scene(path: str | PathLike[str], overrides: Sequence[str] = (), *, laws: Laws) -> LoadedScene:
     """Read a scene from a TOML file.

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Iterable
 from contextlib import suppress
+from pathlib import Path
 
 from mpmcli.check.finding import Finding, merged, passes
 from mpmcli.check.result_check import check_result
@@ -74,8 +75,9 @@ def simulate(
     run = None if complete else _build(scene, settings, plan, backend)
     if stop():
         raise KeyboardInterrupt
-    # Last, because it removes an earlier result.
-    with take_directory(settings.directory, settings.overwrite, resume=settings.resume) as taken:
+    # Last, because what is in it may be replaced.
+    inputs = loaded.inputs
+    with take_directory(settings.directory, settings.overwrite, resume=settings.resume, inputs=inputs) as taken:
         if settings.resume:
             # Checked again under the lock, which excludes other writers.
             earlier = find_resumption(loaded, settings.directory)
@@ -126,10 +128,17 @@ def _store_run(
         summary.outlook = context.check.outlook(stored=stored)
         summary.compiling = None if stored else context.check.forecast.compile_seconds
     on_start(summary)
-    record = new_record(context, summary)
-    record.write()
-    write_scene(context.directory, text)
-    store = new_store(context, header.stored)
+    record, taken = new_record(context, summary), context.taken
+
+    def begin(first: Path | None = None) -> None:
+        if taken.replaces:
+            taken.clear(first)
+        record.write()
+        write_scene(context.directory, text)
+
+    if not taken.replaces:
+        begin()
+    store = new_store(context, header.stored, begin if taken.replaces else None)
     options = {"size": plan.particles * plan.bytes_per_particle, "every": settings.checkpoint_every}
     checkpoints = Checkpointer(context.directory, run, store, summary.backend, forced=context.forced, **options)
     clock = Stopwatch(summary.timings, context.began)
@@ -154,16 +163,20 @@ def _store_run(
             raise
         summary.status, summary.message = "failed", out_of_memory_sentence(context.backend.arch, error)
     finally:
-        if summary.status == "running":
+        if summary.status == "running" and not taken.replaces:
             # A fault of mpmcli: the record must not state that the run continues.
             record.close("failed", "an internal error ended the run")
     summary.steps = run.step_count
+    if taken.replaces:
+        summary.message = f"{summary.message.rstrip('.')}; the earlier result in {context.directory} is kept."
+        taken.undo()
+        return summary
     clock.book(run.first_step_seconds, "compile_s")
     with clock.adding("output_s"):
         finish(context, store, summary, halt)
     clock.stop()
     if summary.status == "interrupted" and not summary.frames:
-        context.taken.undo()
+        taken.undo()
         return summary
     record.timings = summary.timings
     record.close(summary.status, summary.message, **failure)

@@ -1,7 +1,7 @@
 """Creates and completes the files of a run: record, scene, frames and checkpoints."""
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -79,11 +79,13 @@ def new_summary(context: RunContext) -> RunSummary:
     return summary
 
 
-def new_store(context: RunContext, header: dict[str, Any]) -> SegmentStore:
-    """Return the store of a run, which continues after the existing frames."""
+def new_store(
+    context: RunContext, header: dict[str, Any], replace_earlier: Callable[[Path], None] | None = None
+) -> SegmentStore:
+    """Return the store of a run, which continues after the existing frames, or replaces those of another run."""
     scene, earlier = context.scene, context.earlier
-    compress, colliders = scene.output.compress, scene.colliders
-    store = SegmentStore(context.directory, header, compress=compress, hold=HOLD, colliders=colliders)
+    options = {"compress": scene.output.compress, "colliders": scene.colliders, "replace_earlier": replace_earlier}
+    store = SegmentStore(context.directory, header, hold=HOLD, **options)
     if earlier is not None and earlier.index is not None:
         store.go_on_after(earlier.index)
     return store

@@ -199,7 +199,7 @@ def write_report(report: Report, directory: Path) -> None:
     try:
         (directory / FIGURES).mkdir(exist_ok=True)
         for entry in report.case_reports:
-            with sealed(directory / FIGURES / f"{entry.case.name}.svg") as temporary:
+            with sealed(directory / FIGURES / f"{entry.case.name}.svg", unique=True) as temporary:
                 temporary.write_bytes(draw_case(entry.case, entry.results))
         write_text(directory / PAGE, report.page())
     except OSError as error:
