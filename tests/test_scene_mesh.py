@@ -18,7 +18,7 @@ from mpmcli.materials.registry import laws, parameter_models
 from mpmcli.output.header import RunHeader
 from mpmcli.scene import Scene, parse_scene, sample_bodies, scene_to_toml
 from mpmcli.scene.mesh import ClosedSurface, Mesh, _surface_of, read_mesh
-from mpmcli.scene.points import GeometryFileError
+from mpmcli.scene.points import GeometryFileError, distinct_rows
 from mpmcli.scene.shapes import Ball, Shape, distance_grid
 
 R = 0.4
@@ -65,6 +65,14 @@ def test_the_inside_of_a_ball(tmp_path: Path) -> None:
         away = np.linalg.norm(points, axis=1)
         depth = R * (1 - math.cos(math.pi / 60) ** 2)
         assert form.contains(points)[away < R - depth].all() and not form.contains(points)[away > R].any()
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from([2, 3]))
+def test_rows_are_told_apart_as_numpy_does(seed: int, k: int) -> None:
+    rows = np.random.default_rng(seed).integers(-2, 2, (40, k)) * 0.1
+    _, first, which = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    found = distinct_rows(rows)
+    assert np.array_equal(found[0], first) and np.array_equal(found[1], which.reshape(-1))
 
 
 def test_distances_of_a_torus(tmp_path: Path) -> None:

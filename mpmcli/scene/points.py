@@ -79,6 +79,20 @@ def read_geometry(path: Path) -> Geometry:
         raise GeometryFileError from None
 
 
+def distinct_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the first of each distinct row of (n, k), k > 1, in the order of their values, and which each row is.
+
+    By integer keys, since `np.unique` of rows compares them one by one: ten times as long.
+    """
+    first = which = np.zeros(len(rows), np.int64)
+    for k, column in enumerate(rows.T):
+        values, here = np.unique(column, return_inverse=True)
+        which = which * len(values) + here
+        if k > 0:
+            _, first, which = np.unique(which, return_index=True, return_inverse=True)
+    return first, which
+
+
 def _by_trimesh(path: Path) -> Geometry:
     import trimesh
 
@@ -100,7 +114,7 @@ def _by_trimesh(path: Path) -> Geometry:
     if triangles.size and not 0 <= triangles.min() <= triangles.max() < len(vertices):
         raise ValueError("a corner is no vertex")
     # Corners of STL, and those of OBJ that have several texture coordinates, are one point.
-    first = np.unique(vertices, axis=0, return_index=True)[1]
+    first, _ = distinct_rows(vertices)
     points = vertices if path.suffix.lower() == ".ply" else vertices[np.sort(first)]
     return Geometry(points, vertices, np.array(triangles))
 
