@@ -377,6 +377,23 @@ def test_fewer_particles_are_the_same_ones_in_every_format_and_frame(tmp_path, f
     assert metadata["dx"] == pytest.approx(0.025 * (36 / 24) ** 0.5)
 
 
+def test_statistics_are_of_active_particles(tmp_path):
+    """A third waits up to frame 4, and a third is gone from frame 8 on; at --stride 2 too."""
+    made = made_trajectory(0, particles=30)
+    status = np.ones((FRAMES, 30), np.int8)
+    status[:5, :10], status[8:, 10:20] = 0, 2
+    made.header["scene"] = made.header["scene"].replace("walls = {  }", 'walls = { default = "slip", x_max = "open" }')
+    path = write_dataset(tmp_path / "set", [replace(made, fields=made.fields | {"status": status})])
+    for stride in (1, 2):
+        exported(path, "npz", tmp_path / "out", "--stride", stride, "--overwrite")
+        there = np.where(status[::stride, :, None] == 1, made.position[::stride].astype(float), np.nan)
+        v = np.diff(there, axis=0)
+        found = metadata_of(tmp_path / "out")
+        for name, values in {"vel": v, "acc": np.diff(v, axis=0)}.items():
+            assert found[f"{name}_mean"] == pytest.approx(np.nanmean(values, axis=(0, 1)), rel=1e-9)
+            assert found[f"{name}_std"] == pytest.approx(np.nanstd(values, axis=(0, 1)), rel=1e-9)
+
+
 @pytest.mark.parametrize("form", FORMS)
 def test_the_same_export_has_the_same_bytes(tmp_path, form):
     path = made_dataset(tmp_path / "set")

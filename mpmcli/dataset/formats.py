@@ -316,10 +316,11 @@ class Npz(Format):
             why = "Some trajectories have fewer than three frames"
         elif any(outruns_periods(each) for each in self.trajectories):
             why = "Particles cross half of a periodic domain between two exported frames"
-        if why:
-            return facts, [f"{why}: metadata.json has no statistics of motion."]
-        statistics, notes = learning_facts(self.trajectories)
-        return facts | statistics, notes
+        try:
+            statistics, notes = ({}, []) if why else learning_facts(self.trajectories)
+        except ValueError:
+            why, statistics, notes = "A trajectory has no particle that is active in three frames", {}, []
+        return facts | statistics, [f"{why}: metadata.json has no statistics of motion."] if why else notes
 
     @staticmethod
     def _arrays(trajectory: SubsampledTrajectory) -> Iterable[tuple[str, np.ndarray]]:
