@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import h5py
@@ -183,6 +184,8 @@ CARD, MONTAGE = "README.md", "montage.png"
 # Bins of a histogram; if there are few distinct values, each is counted separately.
 BINS = 10
 MOST_COUNTED = 6
+# Probability of such ranks by chance below which trajectories left out are said to cluster.
+CLUSTERED = 0.05
 LEVELS = "▁▂▃▄▅▆▇█"
 EMPTY = "·"
 
@@ -210,7 +213,7 @@ def write_card(directory: Path) -> Path:
         _contents(directory, included) if included else "No trajectory is included.",
         _counts(facts["count"], rows),
         _left_out([row for row in rows if not row.accepted]),
-        _drawn(sweep, included),
+        _drawn(sweep, rows),
         loading,
         f"Drawn with seed {facts['seed']}; computed with mpmcli {facts['version']}. `sweep.toml` and `base.toml` are "
         "the sweep and its base scene.",
@@ -310,21 +313,24 @@ def _left_out(rows: Sequence[Row]) -> str:
     return "\n".join(["Left out:", "", *lines])
 
 
-def _drawn(sweep: Mapping[str, Any], included: Sequence[Row]) -> str:
-    """Return a table of the varying keys, and of the drawn values of the included trajectories."""
+def _drawn(sweep: Mapping[str, Any], rows: Sequence[Row]) -> str:
+    """Return a table of the varying keys, and of the values drawn, with a line for each key that decides who is in."""
     components: dict[str, DrawnComponent] = {}
-    for row in included:
+    for row in rows:
         for label, source, value in values_of(sweep, json.loads(row.draws)):
-            components.setdefault(label, DrawnComponent(label, source)).add(value)
-    rows = [(f"`{label}`", source, *rest) for label, source, *rest in (one.row for one in components.values())]
-    if not rows:
+            components.setdefault(label, DrawnComponent(label, source)).add(value, row.accepted)
+    if not components or not any(row.accepted for row in rows):
         return ""
-    method = sweep.get("method", "random")
     head = ("key", "drawn from", "min", "mean", "max", "values")
-    return (
+    # What was left out has a column if there is any.
+    head += ("left out",) * (not all(row.accepted for row in rows))
+    told = [(f"`{one.label}`", one.source, *one.row[2 : len(head)]) for one in components.values()]
+    method = sweep.get("method", "random")
+    lines = [
         f"## What varies\n\nWhat the included trajectories have drawn (method: {method}); a histogram has ten bins "
-        f"from min to max.\n\n{markdown_table(head, rows, range(len(head)))}"
-    )
+        f"from the smallest to the largest value drawn.\n\n{markdown_table(head, told, range(len(head)))}"
+    ]
+    return "\n\n".join([*lines, *filter(None, (one.truncation() for one in components.values()))])
 
 
 _LOADING = """\
@@ -380,38 +386,58 @@ class DrawnComponent:
 
     def __init__(self, label: str, source: str) -> None:
         self.label, self.source = label, source
-        self._numbers = array("d")
-        self._texts: Counter[str] = Counter()
+        # Of the trajectories left out, and of those included.
+        self._numbers = array("d"), array("d")
+        self._texts: tuple[Counter[str], Counter[str]] = Counter(), Counter()
 
-    def add(self, value: Any) -> None:
-        """Count a value: a finite number, or any other JSON value."""
+    def add(self, value: Any, accepted: bool = True) -> None:
+        """Count a value, a finite number or any other JSON value, of a trajectory that is included or left out."""
         if isinstance(value, int | float) and not isinstance(value, bool):
-            self._numbers.append(value)
+            self._numbers[accepted].append(value)
         else:
-            self._texts[value if isinstance(value, str) else json.dumps(value)] += 1
+            self._texts[accepted][value if isinstance(value, str) else json.dumps(value)] += 1
 
     @property
     def row(self) -> tuple[str, ...]:
-        """Label, source, minimum, mean, maximum and distribution, as text; "" if there is none."""
-        ends = ("", "", "")
-        if self._numbers and not self._texts:
+        """Label, source, minimum, mean, maximum and distribution, and that of values left out; "" if there is none."""
+        ends, numbers = ("", "", ""), self._numbers[True]
+        if numbers and not self._texts[True]:
             # The exact sum is independent of the order.
-            mean = math.fsum(self._numbers) / len(self._numbers)
-            ends = (number_text(min(self._numbers)), number_text(mean), number_text(max(self._numbers)))
+            mean = math.fsum(numbers) / len(numbers)
+            ends = (number_text(min(numbers)), number_text(mean), number_text(max(numbers)))
+        return (self.label, self.source, *ends, self._distribution(True), self._distribution(False))
+
+    def _distribution(self, accepted: bool) -> str:
+        drawn = [*self._numbers[True], *self._numbers[False]]
         # Sorted as numbers; a key that draws texts has few distinct ones.
-        counts = Counter(map(number_text, sorted(self._numbers))) + self._texts
-        repeated = len(counts) < max(len(self._numbers), 2)
-        if (len(counts) <= MOST_COUNTED and repeated) or self._texts:
+        distinct = len({*map(number_text, drawn), *self._texts[True], *self._texts[False]})
+        if (distinct <= MOST_COUNTED and distinct < max(len(drawn), 2)) or any(self._texts):
+            counts = Counter(map(number_text, sorted(self._numbers[accepted]))) + self._texts[accepted]
             told = [f"{value}: {count}" for value, count in list(counts.items())[:MOST_COUNTED]]
-            drawn = ", ".join([*told, "..."] if len(counts) > MOST_COUNTED else told)
-        else:
-            drawn = f"`{histogram(self._numbers)}`"
-        return (self.label, self.source, *ends, drawn)
+            return ", ".join([*told, "..."] if len(counts) > MOST_COUNTED else told)
+        numbers = self._numbers[accepted]
+        return f"`{histogram(numbers, min(drawn), max(drawn))}`" if numbers else ""
+
+    def truncation(self) -> str:
+        """Return a sentence if the values left out rank otherwise than those included (Mann and Whitney), else ""."""
+        gone, kept = self._numbers
+        if not gone or not kept or any(self._texts):
+            return ""
+        from scipy.stats import mannwhitneyu
+
+        found = mannwhitneyu(gone, kept)
+        if not found.pvalue < CLUSTERED:
+            return ""
+        side = "lower" if found.statistic < len(gone) * len(kept) / 2 else "higher"
+        return (
+            f"The trajectories left out have {side} values of `{self.label}` than those included (medians "
+            f"{number_text(median(gone))} and {number_text(median(kept))}; a rank test gives p = {found.pvalue:.2g}): "
+            "the dataset lacks this end of the distribution."
+        )
 
 
-def histogram(values: Sequence[float]) -> str:
-    """Return bars with heights proportional to the counts in equal bins from the smallest to the largest value."""
-    low, high = min(values), max(values)
+def histogram(values: Sequence[float], low: float, high: float) -> str:
+    """Return bars with heights proportional to the counts in equal bins between two values."""
     counts = [0] * BINS
     for value in values:
         counts[min(BINS - 1, int(BINS * ((value - low) / (high - low))))] += 1
