@@ -110,6 +110,19 @@ def test_a_bad_file_is_one_sentence(tmp_path: Path, name: str, text: str | None,
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("suffix", [".pkl", ".pickle", ".pvd", ".pvtu", ".vtm", ".gltf", ".xdmf", ".bdf", ""])
+def test_a_file_of_another_kind_is_not_opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str) -> None:
+    """PyVista 0.45 to 0.47 runs the code of a pickle, and files that name others have digests without them."""
+    asked = []
+    for reader in ("pyvista.read", "trimesh.load", "meshio.read"):
+        monkeypatch.setattr(reader, lambda *found, **_: asked.append(found))
+    (tmp_path / f"p{suffix}").write_bytes(b"cos\nsystem\n(S'touch ran'\ntR.")
+    for shape in ({"points": {"file": f"p{suffix}", "spacing": 0.1}}, {"mesh": {"file": f"p{suffix}"}}):
+        with pytest.raises(InputError, match=r"the files that are read are \.obj, .* and \.vtu; save it as"):
+            scene_of(tmp_path, {}, 3, shape=shape)
+    assert not asked
+
+
 def test_points_are_not_combined_and_lie_in_their_plane(tmp_path: Path) -> None:
     """What an array must be, and where points make no sense."""
     table = write(tmp_path / "p.vtp", 3)

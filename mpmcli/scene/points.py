@@ -1,6 +1,6 @@
 """Points and triangles from a file, and bodies given by points, each of which is a particle.
 
-The suffix selects the reader: CSV and NPY here; STL, OBJ and PLY by trimesh; all others by PyVista. VTK ends the
+The suffix selects the reader: CSV and NPY here; OBJ, OFF, PLY and STL by trimesh; others by PyVista. VTK ends the
 process at a truncated binary PLY; trimesh raises. trimesh refuses a PLY with faces of different lengths; meshio reads
 it.
 """
@@ -22,8 +22,11 @@ from mpmcli.scene.primitives import Solid
 from mpmcli.scene.problem import hint_at, listed, quoted
 from mpmcli.scene.quantity import AXES, Positive, Table, Vector, flaw, scene_dimension
 
-# Suffixes of files that trimesh reads.
-_BY_TRIMESH = (".obj", ".ply", ".stl")
+# Suffixes of files that trimesh reads, and those that PyVista reads: each file is complete, so that one digest covers
+# it. No other file is opened: .pvd, .pvtu, .vtm and more name further files, a pickle runs code, and some readers end
+# the process.
+_BY_TRIMESH = (".obj", ".off", ".ply", ".stl")
+_BY_VTK = (".glb", ".mesh", ".msh", ".vti", ".vtk", ".vtkhdf", ".vtp", ".vtr", ".vts", ".vtu")
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +70,9 @@ def absence(path: Path) -> str:
 
 def read_geometry(path: Path) -> Geometry:
     """Return the points and the triangles in a file, or raise a GeometryFileError."""
+    if path.suffix.lower() not in _BY_TRIMESH + _BY_VTK:
+        known = listed([*_BY_TRIMESH, *_BY_VTK], "and")
+        raise GeometryFileError(f"the files that are read are {known}; save it as one of these, such as VTU")
     if fault := absence(path):
         raise GeometryFileError(fault)
     try:
@@ -250,8 +256,9 @@ def _npy(path: Path, d: int) -> dict[str, np.ndarray]:
 def _data_set(path: Path, d: int, velocity: str | None) -> tuple[np.ndarray, np.ndarray | None]:
     try:
         found = read_geometry(path)
-    except GeometryFileError:
-        raise GeometryFileError("it is not a readable file of points (CSV, NPY, PLY and VTU are)") from None
+    except GeometryFileError as error:
+        said = str(error) or "it is not a readable file of points (CSV, NPY, PLY and VTU are)"
+        raise GeometryFileError(said) from None
     if not len(found.points):
         raise GeometryFileError("it holds no point")
     position = _in_plane(found.points, d, "points")
