@@ -5,6 +5,7 @@ import re
 import sqlite3
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from made_sweep import COUNT, VERDICTS, made_workers, make_dataset  # noqa: F401
@@ -39,6 +40,23 @@ def test_the_card_says_what_the_dataset_holds():
     rows = {row[0]: row[1:] for row in table(card, "split")}
     assert rows["all"] == ["12", "10", "10", "1", "1"]
     assert {split: int(rows[split][1]) for split in opened.splits} == {s: len(n) for s, n in opened.splits.items()}
+
+
+def test_the_card_begins_with_the_files_of_each_split():
+    """As YAML between lines of three dashes; each is a table of the trajectories of its split, none in quarantine."""
+    dataset = make_dataset("whole")
+    opened, lines = mpmcli.dataset.open(dataset), card_of(dataset).split("---\n")
+    assert lines[0] == "" and any((dataset / "quarantine").iterdir())
+    files = dict(re.findall(r"  - split: (\w+)\n    path: (\S+)\n", lines[1]))
+    assert set(files) == set(opened.splits)
+    for split, numbers in opened.splits.items():
+        rows = [json.loads(line) for line in (dataset / files[split]).read_text(encoding="utf-8").splitlines()]
+        assert [row["number"] for row in rows] == list(numbers)
+        for row, number in zip(rows, numbers, strict=True):
+            with h5py.File(dataset / row["file"]) as shard:
+                shape = shard[row["group"]]["position"].shape
+            assert shape[:2] == (row["frames"], row["particles"])
+            assert json.loads(row["draws"]) == opened[number].draws
 
 
 def test_the_reasons_are_told_without_paths():

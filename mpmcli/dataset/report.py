@@ -191,7 +191,7 @@ EMPTY = "·"
 
 
 def write_card(directory: Path) -> Path:
-    """Write the card of a dataset whose trajectories have all been tried, and return its path.
+    """Write the card of a dataset whose trajectories have all been tried, and tables of its splits; return its path.
 
     Its bytes depend on the sweep and the trajectories alone, not on times, machines, interrupts or parts. It shows the
     picture montage.png if the directory contains one.
@@ -202,11 +202,12 @@ def write_card(directory: Path) -> Path:
     sweep = tomllib.loads(sweep_text)
     base = tomllib.loads((directory / BASE).read_text(encoding="utf-8"))
     included = [row for row in rows if row.accepted]
-    loading = ""
+    tables, loading = split_tables(included), ""
     if included:
         one, d = included[0], len(base["domain"]["size"])
         loading = _LOADING.format(file=one.file, group=group_name(one.number), split=one.split, d=d)
     sections = [
+        _front_matter(tables),
         f"# {one_line(base.get('title') or 'Trajectories of particles')}",
         first_paragraph(sweep_text),
         "![Some of the trajectories](montage.png)" if (directory / MONTAGE).is_file() else "",
@@ -219,10 +220,31 @@ def write_card(directory: Path) -> Path:
         "the sweep and its base scene.",
     ]
     try:
+        for name, text in tables.items():
+            write_text(directory / name, text)
         write_text(directory / CARD, "\n\n".join(section for section in sections if section) + "\n")
     except OSError as error:
         raise RunError(f"{directory / CARD} could not be written ({error.strerror}); the dataset is kept.") from error
     return directory / CARD
+
+
+def split_tables(included: Sequence[Row]) -> dict[str, str]:
+    """Return a table of each split that has trajectories, as JSON lines by the name of its file, for `load_dataset`.
+
+    Of files of HDF5 that function makes one table, whatever their splits, and it would take those in quarantine.
+    """
+    found: dict[str, str] = {}
+    for row in sorted(included, key=lambda row: SPLITS.index(row.split)):
+        facts = {name: getattr(row, name) for name in ("number", "file", "frames", "particles", "draws")}
+        name = f"{row.split}.jsonl"
+        found[name] = found.get(name, "") + json.dumps(facts | {"group": group_name(row.number)}) + "\n"
+    return found
+
+
+def _front_matter(tables: Collection[str]) -> str:
+    """Return the YAML with which a card on Hugging Face begins: the file of each split."""
+    lines = [f"  - split: {name.removesuffix('.jsonl')}\n    path: {name}" for name in tables]
+    return "\n".join(["---", "configs:", "- config_name: default", "  data_files:", *lines, "---"]) if lines else ""
 
 
 def first_paragraph(text: str) -> str:
@@ -346,7 +368,7 @@ position, velocity = trajectory.position, trajectory.velocity    # (T, N, {d}), 
 times, body, draws = trajectory.times, trajectory.body, trajectory.draws
 ```
 
-With h5py alone:
+With h5py alone; `datasets.load_dataset(".")` of Hugging Face has each one's `file`, `group` and `draws`, by split:
 
 ```python
 import h5py
