@@ -5,6 +5,7 @@ import re
 import sqlite3
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from made_sweep import COUNT, VERDICTS, made_workers, make_dataset  # noqa: F401
@@ -39,6 +40,23 @@ def test_the_card_says_what_the_dataset_holds():
     rows = {row[0]: row[1:] for row in table(card, "split")}
     assert rows["all"] == ["12", "10", "10", "1", "1"]
     assert {split: int(rows[split][1]) for split in opened.splits} == {s: len(n) for s, n in opened.splits.items()}
+
+
+def test_the_card_begins_with_the_files_of_each_split():
+    """As YAML between lines of three dashes; each is a table of the trajectories of its split, none in quarantine."""
+    dataset = make_dataset("whole")
+    opened, lines = mpmcli.dataset.open(dataset), card_of(dataset).split("---\n")
+    assert lines[0] == "" and any((dataset / "quarantine").iterdir())
+    files = dict(re.findall(r"  - split: (\w+)\n    path: (\S+)\n", lines[1]))
+    assert set(files) == set(opened.splits)
+    for split, numbers in opened.splits.items():
+        rows = [json.loads(line) for line in (dataset / files[split]).read_text(encoding="utf-8").splitlines()]
+        assert [row["number"] for row in rows] == list(numbers)
+        for row, number in zip(rows, numbers, strict=True):
+            with h5py.File(dataset / row["file"]) as shard:
+                shape = shard[row["group"]]["position"].shape
+            assert shape[:2] == (row["frames"], row["particles"])
+            assert json.loads(row["draws"]) == opened[number].draws
 
 
 def test_the_reasons_are_told_without_paths():
@@ -142,15 +160,38 @@ def test_the_times_of_the_manifest_do_not_matter():
 
 
 def test_a_histogram_counts_every_value():
-    assert histogram([0.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0]) == "▁········█"
-    assert histogram([k / 10 for k in range(11)]) == "▄▄▄▄▄▄▄▄▄█"
+    assert histogram([0.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0], 0.0, 1.0) == "▁········█"
+    assert histogram([k / 10 for k in range(11)], 0.0, 1.0) == "▄▄▄▄▄▄▄▄▄█"
+
+
+def test_values_left_out_are_shown_and_told_if_they_cluster():
+    """Three of eight draws are the lowest in 2 of 56 choices of three, at either end: p = 0.036; 1, 4 and 7 are not."""
+    for gone, told in (((0, 1, 2), "lower"), ((5, 6, 7), "higher"), ((0, 3, 6), "")):
+        component = DrawnComponent("bodies.jelly.material.youngs_modulus", "uniform [10, 90]")
+        for k in range(8):
+            component.add(10.0 + 10 * k, k not in gone)
+        *_, drawn, left = component.row
+        # Eight values evenly over ten bins; the two histograms have the same ones.
+        bins = [min(9, 10 * k // 7) for k in range(8)]
+        assert {k for k, bar in enumerate(left.strip("`")) if bar != "·"} == {bins[k] for k in gone}
+        assert {k for k, bar in enumerate(drawn.strip("`")) if bar != "·"} == {bins[k] for k in {*range(8)} - {*gone}}
+        said = component.truncation()
+        assert bool(said) == bool(told) and f"have {told} values" in (said or "have  values")
+        assert not told or "p = 0.036" in said
+
+
+def test_the_card_shows_what_was_left_out():
+    dataset = make_dataset("whole")
+    rows = table(card_of(dataset), "key")
+    left = {row[0].strip("`"): row[6] for row in rows}
+    assert sum(int(one.split(": ")[1]) for one in left["place.sand.count"].split(", ")) == 2
 
 
 def test_texts_and_constants_are_counted():
     component = DrawnComponent("bodies.ball.material", 'choice ["jelly", "rubber"]')
     for value in ("jelly", "rubber", "jelly"):
         component.add(value)
-    assert component.row[2:] == ("", "", "", "jelly: 2, rubber: 1")
+    assert component.row[2:] == ("", "", "", "jelly: 2, rubber: 1", "")
     sweep = {"vary": {"time.end": 2, "domain.gravity": {"uniform": [[0, -10], [0, -9]]}}}
     told = list(values_of(sweep, json.loads('{"time.end": 2, "domain.gravity": [0, -9.5]}')))
     assert told == [

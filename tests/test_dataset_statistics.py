@@ -44,6 +44,18 @@ def test_each_trajectory_counts_the_same(dimension=2):
     assert found["acc_mean"].tolist() == [0.0, 0.0]
 
 
+def test_only_particles_that_are_there_count():
+    """Of a particle that waits, falls and is gone, and one that stays: displacements 1, 2 and 0 three times."""
+    nan = np.nan
+    position = np.array([[nan, 5.0], [0.0, 5.0], [1.0, 5.0], [3.0, 5.0], [nan, nan]])[..., None]
+    for block in (1, 2, 5):
+        found = motion_statistics([[position[k : k + block] for k in range(0, 5, block)]])
+        v, a = np.array([1.0, 2.0, 0.0, 0.0, 0.0]), np.array([1.0, 0.0, 0.0])
+        agree(found, {"vel_mean": v.mean(), "vel_std": v.std(), "acc_mean": a.mean(), "acc_std": a.std()})
+    with pytest.raises(ValueError, match="three frames"):
+        motion_statistics([[position[:3, :1]]])
+
+
 def test_a_deviation_of_zero_becomes_one():
     found = motion_statistics([[np.zeros((5, 3, 2))]])
     assert found["vel_std"].tolist() == found["acc_std"].tolist() == [1.0, 1.0]

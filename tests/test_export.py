@@ -2,7 +2,10 @@
 
 import json
 import os
+import pickletools
 import shutil
+import tomllib
+import zipfile
 from collections import namedtuple
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +14,7 @@ import h5py
 import numpy as np
 import pytest
 from command import run_here
-from made_dataset import COUNTS, PAUSE, SPLITS, made_dataset, made_trajectory, write_dataset
+from made_dataset import COUNTS, PAUSE, SPLITS, made_dataset, made_header, made_trajectory, write_dataset
 from made_result import write_made
 from test_dataset_statistics import agree, plain
 
@@ -19,7 +22,11 @@ import mpmcli.dataset
 from mpmcli.dataset.folder import MANIFEST, Manifest, Row
 from mpmcli.dataset.formats import FORMATS
 from mpmcli.dataset.subsample import chosen_particles, joined_row
+from mpmcli.materials.registry import laws as registered
+from mpmcli.materials.registry import parameter_models
 from mpmcli.output import open_result
+from mpmcli.output.header import RunHeader
+from mpmcli.scene import parse_scene, scene_to_toml
 
 FORMS = tuple(FORMATS)
 FRAMES, INPUTS = 11, 6
@@ -280,12 +287,56 @@ def test_gns_has_one_property_where_one_parameter_differs(tmp_path):
 
 def test_gns_has_several_properties_where_several_parameters_differ(tmp_path):
     made = [made_trajectory(k, viscosity=0.5 * k, density=1500.0 + k) for k in range(2)]
-    answer = exported(write_dataset(tmp_path / "set", made), "gns", tmp_path / "out")
+    path = write_dataset(tmp_path / "set", made)
+    assert "density and viscosity differ" in refused(path, "gns", tmp_path / "out")
+    assert '"cohesion" does not differ' in refused(path, "gns", tmp_path / "out", "--features", "cohesion")
+    assert "--features is for --to gns" in refused(path, "npz", tmp_path / "out", "--features", "none")
+    answer = exported(path, "gns", tmp_path / "out", "--features", "density,viscosity")
     assert metadata_of(tmp_path / "out")["material_feature_names"] == ["density", "viscosity"]
     assert any("np.full" in note for note in answer["notes"])
     (_, _, properties, _), _ = GnsReader(tmp_path / "out" / "train.npz")[FRAMES - INPUTS]
     expected = np.array([[1000.0, 0.5], [1501.0, 0.0]])
     np.testing.assert_array_equal(properties, expected[made[1].body])
+    exported(path, "gns", tmp_path / "out", "--features", "viscosity", "--overwrite")
+    (_, _, properties, _), _ = GnsReader(tmp_path / "out" / "train.npz")[FRAMES - INPUTS]
+    np.testing.assert_array_equal(properties, expected[made[1].body, 1])
+    exported(path, "gns", tmp_path / "out", "--features", "none", "--overwrite")
+    assert not GnsReader(tmp_path / "out" / "train.npz").with_property
+
+
+def test_a_modulus_that_mpmcli_chose_is_no_property(tmp_path):
+    """It depends on the scene, here on the speed; one that the scene states is a property."""
+    headers = []
+    for speed, modulus in ((1.0, "auto"), (2.0, "auto"), (1.0, 2e6), (1.0, 3e6)):
+        data = tomllib.loads(
+            made_header()["scene"].replace('law = "fluid"', f'law = "fluid", bulk_modulus = "{modulus}"')
+        )
+        data["bodies"][0] |= {"velocity": [speed, 0.0]}
+        data["bodies"][1]["shape"]["box"] = {"min": [0.6, 0.6], "max": [0.8, 0.8]}
+        data["bodies"][0]["material"]["bulk_modulus"] = modulus
+        scene = parse_scene(data, laws=parameter_models()).scene
+        laws = [registered()[name] for name in ("fluid", "sand")]
+        headers.append(RunHeader.of(scene, scene_to_toml(scene), laws, made_header()["backend"]).stored)
+    for name, some, expected in (
+        ("auto", headers[:2], False),
+        ("stated", headers[2:], True),
+        ("mixed", headers[1:3], False),
+    ):
+        made = [replace(made_trajectory(k), header=header) for k, header in enumerate(some)]
+        (tmp_path / name).mkdir()
+        exported(write_dataset(tmp_path / name / "set", made), "gns", tmp_path / name / "out")
+        assert GnsReader(tmp_path / name / "out" / "train.npz").with_property == expected
+        assert metadata_of(tmp_path / name / "out")["material_feature_names"] == ["bulk_modulus"] * expected
+
+
+def test_numpy_before_its_core_was_renamed_reads_a_gns_export(tmp_path):
+    """Its pickles name nothing but `numpy.ndarray`, `numpy.dtype` and the codec of protocol 3."""
+    exported(made_dataset(tmp_path / "set"), "gns", tmp_path / "out")
+    with zipfile.ZipFile(tmp_path / "out" / "train.npz") as archive:
+        for name in archive.namelist():
+            pickled = archive.read(name).split(b"\n", 1)[1]
+            found = {arg for code, arg, _ in pickletools.genops(pickled) if code.name == "GLOBAL"}
+            assert found == {"numpy ndarray", "numpy dtype"}
 
 
 @pytest.mark.parametrize("form", ["lagrangebench", "gns"])
@@ -375,6 +426,23 @@ def test_fewer_particles_are_the_same_ones_in_every_format_and_frame(tmp_path, f
     assert metadata["num_particles_max"] == 24 and metadata["particle_seed"] == 0
     # The largest trajectory had 36 particles: 24 of them are as far apart as on a lattice with 2/3 of its points.
     assert metadata["dx"] == pytest.approx(0.025 * (36 / 24) ** 0.5)
+
+
+def test_statistics_are_of_active_particles(tmp_path):
+    """A third waits up to frame 4, and a third is gone from frame 8 on; at --stride 2 too."""
+    made = made_trajectory(0, particles=30)
+    status = np.ones((FRAMES, 30), np.int8)
+    status[:5, :10], status[8:, 10:20] = 0, 2
+    made.header["scene"] = made.header["scene"].replace("walls = {  }", 'walls = { default = "slip", x_max = "open" }')
+    path = write_dataset(tmp_path / "set", [replace(made, fields=made.fields | {"status": status})])
+    for stride in (1, 2):
+        exported(path, "npz", tmp_path / "out", "--stride", stride, "--overwrite")
+        there = np.where(status[::stride, :, None] == 1, made.position[::stride].astype(float), np.nan)
+        v = np.diff(there, axis=0)
+        found = metadata_of(tmp_path / "out")
+        for name, values in {"vel": v, "acc": np.diff(v, axis=0)}.items():
+            assert found[f"{name}_mean"] == pytest.approx(np.nanmean(values, axis=(0, 1)), rel=1e-9)
+            assert found[f"{name}_std"] == pytest.approx(np.nanstd(values, axis=(0, 1)), rel=1e-9)
 
 
 @pytest.mark.parametrize("form", FORMS)

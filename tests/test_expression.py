@@ -8,8 +8,17 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from mpmcli.scene.expression import FUNCTIONS, OPERATORS, Expression, ExpressionError, derivative, evaluate
-from mpmcli.scene.expression_reader import MOST_CHARACTERS, MOST_NESTED, parse
+from mpmcli.scene.expression import (
+    FUNCTIONS,
+    OPERATORS,
+    Apply,
+    Expression,
+    ExpressionError,
+    bounds_of,
+    derivative,
+    evaluate,
+)
+from mpmcli.scene.expression_reader import MOST_CHARACTERS, MOST_NESTED, MOST_NODES, parse
 
 NAMES = ("t", "x", "y", "X", "Y")
 # What Python itself makes of the same text.
@@ -147,6 +156,33 @@ def test_the_derivative_is_the_limit_of_differences(text):
         assert (right | ~smooth).mean() >= 0.99 and np.isfinite(exact).all()
 
 
+SHARED = {
+    "max": "max(" + ", ".join(f"{k}*x" for k in range(1, 31)) + ")",
+    "nested max": "max(x, 1 - x, sin(" * 20 + "x" + "))" * 20,
+    "sin": "sin(" * 50 + "x" + ")" * 50,
+    "clamp": "clamp(" * 25 + "x" + ", x - 9, 9 + x)" * 25,
+    "hypot": "hypot(x, " * 50 + "1" + ")" * 50,
+    "power": "(x + 1)**(" * 20 + "x" + ")" * 20,
+    "product": "*".join(f"(x + {k})" for k in range(50)),
+    "quotient": "/".join(f"(x + {k})" for k in range(50)),
+}
+
+
+@pytest.mark.parametrize("text", SHARED.values(), ids=SHARED)
+def test_a_derivative_shares_the_parts_of_its_expression(text):
+    """It has some nodes for each node of the expression, and walks of it visit each once: 2^20 and more by paths."""
+    tree = parse(text, ("x",)).tree
+    slope = derivative(tree, "x")
+    nodes = len(slope.order) if isinstance(slope, Apply) else 1
+    assert nodes <= 8 * len(tree.order)
+    at, d = 0.3, 1e-7
+    difference = (evaluate(tree, {"x": at + d}) - evaluate(tree, {"x": at - d})) / (2 * d)
+    assert evaluate(slope, {"x": at}) == pytest.approx(difference, rel=1e-5)
+    low, high = bounds_of(slope, {"x": (np.float64(at), np.float64(at))})
+    slack = 1e-9 * abs(difference)
+    assert low - slack <= evaluate(slope, {"x": at}) <= high + slack
+
+
 def test_derivatives_exist_at_tips():
     for text in ("hypot(x, y)", "sqrt(x**2 + y**2)", "abs(x)", "max(x - 1, 0)**0.5", "asin(clamp(x + 2, 0, 1))"):
         assert evaluate(derivative(parse(text, ("x", "y")).tree, "x"), {"x": 0.0, "y": 0.0}) == 0
@@ -196,6 +232,8 @@ FAULTS = {
     "1) + (2": 'is not an expression: "1) + (2" cannot be read near ',
     "+".join(["x"] * 80): f"is nested more than {MOST_NESTED} deep, each term of a sum counted; write it shorter",
     "x" * (MOST_CHARACTERS + 1): f"is too long for an expression: {MOST_CHARACTERS + 1} characters, ",
+    "+".join(["max(" + ",".join(["x"] * 60) + ")"] * 9): "is too large: 557 numbers, names, operators and functions, "
+    f"{MOST_NODES} at most",
     "(" * 900 + "x" + ")" * 900: "is not an expression: ",
     "x\0": "is not an expression: ",
 }

@@ -7,7 +7,7 @@ import pytest
 import taichi as ti
 from test_expression import FUNCTION_CASES
 
-from mpmcli.scene.expression import FUNCTIONS, OPERATORS
+from mpmcli.scene.expression import FUNCTIONS, OPERATORS, derivative, evaluate
 from mpmcli.scene.expression_reader import parse
 from mpmcli.solver.drive.expressions import KERNELS, DeviceValues, Entries, RunValues, node_of
 from mpmcli.solver.engine.batch import RECURSION
@@ -36,11 +36,15 @@ def evaluated(real):
     for field, values in zip(fields, points, strict=True):
         field.from_numpy(values)
     entries = Entries(ORIGIN)
-    trees = [entries.placed(parse(text, NAMES).tree) for text in texts]
+    slope = derivative(parse(MORE["deep"], NAMES).tree, "x")
+    trees = [*(parse(text, NAMES).tree for text in texts), slope]
+    formulas = [entries.placed(tree) for tree in trees]
+    # Each node of a derivative is in a kernel once; by paths there are 2^50.
+    assert len(formulas[-1].steps) < 10 * 50
     values = DeviceValues(1, len(entries.found))
-    nodes = tuple(enumerate(node_of(tree, values) for tree in trees))
+    nodes = tuple(enumerate(node_of(formula, values) for formula in formulas))
     numbers = RunValues(values, 0, entries.found, 0.1, 1.0)
-    found = ti.field(float, shape=(n, len(texts)))
+    found = ti.field(float, shape=(n, len(trees)))
 
     @ti.kernel
     def run(some: ti.template()):
@@ -54,8 +58,8 @@ def evaluated(real):
         run(nodes[first : first + 30])
     places = points.astype(np.float64) + ORIGIN
     at = {"t": TIME, "x": places[0, :, 0], "y": places[0, :, 1], "X": places[1, :, 0], "Y": places[1, :, 1]}
-    expected = np.stack([np.broadcast_to(parse(text, NAMES)(**at), n) for text in texts], axis=1)
-    return found.to_numpy().astype(np.float64), expected, [*FUNCTION_CASES, *MORE]
+    expected = np.stack([np.broadcast_to(evaluate(tree, at), n) for tree in trees], axis=1)
+    return found.to_numpy().astype(np.float64), expected, [*FUNCTION_CASES, *MORE, "slope"]
 
 
 def test_every_function_has_a_kernel():

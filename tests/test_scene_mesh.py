@@ -18,7 +18,7 @@ from mpmcli.materials.registry import laws, parameter_models
 from mpmcli.output.header import RunHeader
 from mpmcli.scene import Scene, parse_scene, sample_bodies, scene_to_toml
 from mpmcli.scene.mesh import ClosedSurface, Mesh, _surface_of, read_mesh
-from mpmcli.scene.points import GeometryFileError
+from mpmcli.scene.points import GeometryFileError, distinct_rows
 from mpmcli.scene.shapes import Ball, Shape, distance_grid
 
 R = 0.4
@@ -65,6 +65,22 @@ def test_the_inside_of_a_ball(tmp_path: Path) -> None:
         away = np.linalg.norm(points, axis=1)
         depth = R * (1 - math.cos(math.pi / 60) ** 2)
         assert form.contains(points)[away < R - depth].all() and not form.contains(points)[away > R].any()
+
+
+def test_an_off_file_may_begin_with_a_comment(tmp_path: Path) -> None:
+    """A unit cube of quads, as geometry programs write it."""
+    quads = "4 0 3 2 1\n4 4 5 6 7\n4 0 1 5 4\n4 1 2 6 5\n4 2 3 7 6\n4 3 0 4 7\n"
+    corners = "0 0 0\n1 0 0\n1 1 0\n0 1 0\n0 0 1\n1 0 1\n1 1 1\n0 1 1\n"
+    (tmp_path / "cube.off").write_text(f"# made for a test\nOFF\n8 6 0\n{corners}{quads}", encoding="utf-8")
+    assert mesh(str(tmp_path / "cube.off")).volume == pytest.approx(1.0, rel=1e-12)
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from([2, 3]))
+def test_rows_are_told_apart_as_numpy_does(seed: int, k: int) -> None:
+    rows = np.random.default_rng(seed).integers(-2, 2, (40, k)) * 0.1
+    _, first, which = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    found = distinct_rows(rows)
+    assert np.array_equal(found[0], first) and np.array_equal(found[1], which.reshape(-1))
 
 
 def test_distances_of_a_torus(tmp_path: Path) -> None:
@@ -226,7 +242,7 @@ def test_a_damaged_file_is_one_sentence_and_nothing_else(
 ) -> None:
     """VTK writes to the terminal what it thinks of it, unless it is kept from it."""
     (tmp_path / name).write_bytes(content)
-    with pytest.raises(GeometryFileError, match=r"it is not a readable mesh|it holds no triangle"):
+    with pytest.raises(GeometryFileError, match=r"not a readable mesh|no triangle|files that are read are"):
         read_mesh(tmp_path / name)
     assert capfd.readouterr() == ("", "")
 

@@ -11,6 +11,7 @@ import pyvista as pv
 from mpmcli.errors import InputError
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import Scene, estimate_particles, highest_speed, parse_scene, sample_bodies
+from mpmcli.scene.points import read_points
 
 RANDOM = np.random.default_rng(3)
 POINTS = {d: RANDOM.uniform(0.1, 0.9, (50, d)) for d in (2, 3)}
@@ -108,6 +109,55 @@ def test_a_bad_file_is_one_sentence(tmp_path: Path, name: str, text: str | None,
         scene_of(tmp_path, table)
     assert any(one in str(caught.value) for one in said.split("|")), caught.value
     assert "\n" not in str(caught.value)
+
+
+PLY = "ply\nformat ascii 1.0\nelement vertex 2\n" + "".join(
+    f"property float {name}\n" for name in ("x", "y", "z", "vx", "vy", "vz")
+)
+# Two points, (0.25, 0.5) at (1, 2) m/s and (0.75, 0.125) at (3, 4) m/s, as programs write them.
+WRITTEN = {
+    "paraview.csv": ('"v:0","v:1","v:2","Points:0","Points:1","Points:2"\n1,2,0,.25,.5,0\n3,4,0,.75,.125,0\n', "v"),
+    "upper.csv": ("X,Y,Z,U,V\n.25,.5,0,1,2\n.75,.125,0,3,4\n", ("U", "V")),
+    "savetxt.csv": ("# x y vx vy\n.25 .5 1 2\n.75 .125 3 4\n", ("vx", "vy")),
+    "commented.txt": ("# made by hand\n#x,y,vx,vy\n.25,.5,1,2\n\n.75,.125,3,4\n", ("vx", "vy")),
+    "german.csv": ("x;y;vx;vy\n0,25;0,5;1,0;2,0\n0,75;0,125;3,0;4,0\n", ("vx", "vy")),
+    "tabs.txt": ("x\ty\tvx\tvy\n.25\t.5\t1\t2\n.75\t.125\t3\t4\n", ("vx", "vy")),
+    "cloud.xyz": (".25 .5 0 1 2 0\n.75 .125 0 3 4 0\n", ("vx", "vy")),
+    "atoms.xyz": ("2\nwater\nO .25 .5 0\nH .75 .125 0\n", None),
+    "cloud.ply": (PLY + "end_header\n.25 .5 0 1 2 0\n.75 .125 0 3 4 0\n", ("vx", "vy")),
+}
+
+
+@pytest.mark.parametrize("name", [*WRITTEN, "vectors.npz", "columns.npz"])
+def test_points_as_programs_write_them(tmp_path: Path, name: str) -> None:
+    position, speeds = np.array([[0.25, 0.5], [0.75, 0.125]]), np.array([[1.0, 2.0], [3.0, 4.0]])
+    if name == "vectors.npz":
+        np.savez(tmp_path / name, position=position, velocity=speeds, note="made")
+        velocity = "velocity"
+    elif name == "columns.npz":
+        np.savez(tmp_path / name, x=position[:, 0], y=position[:, 1], vx=speeds[:, 0], vy=speeds[:, 1])
+        velocity = ("vx", "vy")
+    else:
+        text, velocity = WRITTEN[name]
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    found = read_points(tmp_path / name, 2, velocity)
+    np.testing.assert_array_equal(found[0], position)
+    assert (found[1] is None) == (velocity is None)
+    if velocity is not None:
+        np.testing.assert_array_equal(found[1], speeds)
+
+
+@pytest.mark.parametrize("suffix", [".pkl", ".pickle", ".pvd", ".pvtu", ".vtm", ".gltf", ".xdmf", ".bdf", ""])
+def test_a_file_of_another_kind_is_not_opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str) -> None:
+    """PyVista 0.45 to 0.47 runs the code of a pickle, and files that name others have digests without them."""
+    asked = []
+    for reader in ("pyvista.read", "trimesh.load", "meshio.read"):
+        monkeypatch.setattr(reader, lambda *found, **_: asked.append(found))
+    (tmp_path / f"p{suffix}").write_bytes(b"cos\nsystem\n(S'touch ran'\ntR.")
+    for shape in ({"points": {"file": f"p{suffix}", "spacing": 0.1}}, {"mesh": {"file": f"p{suffix}"}}):
+        with pytest.raises(InputError, match=r"the files that are read are \.obj, .* and \.vtu; save it as"):
+            scene_of(tmp_path, {}, 3, shape=shape)
+    assert not asked
 
 
 def test_points_are_not_combined_and_lie_in_their_plane(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 from scipy.spatial import KDTree
 
+from mpmcli.scene.primitives import edge_distances
 from mpmcli.scene.shapes import Ball, Box, Capsule, Cylinder, Polygon
 
 
@@ -127,6 +128,56 @@ def test_an_accepted_polygon_has_the_area_of_its_inside(vertices):
     box = float(np.prod(upper - lower))
     # An edge passes through at most 2 n of the n^2 lattice cells, each of area box / n^2.
     assert abs(polygon.contains(points).mean() * box - polygon.volume) <= len(vertices) * 2 * box / n
+
+
+def test_polygons_of_many_corners():
+    """Of 30,000, within R (1 - cos(pi / n)) of a circle; a comb and a spiral of as many; the first teeth that meet."""
+    n, R = 30_000, 0.3
+    angle = 2 * math.pi * np.arange(n) / n
+    circle = make(Polygon, 2, vertices=(R * np.stack([np.cos(angle), np.sin(angle)], axis=1)).tolist())
+    assert circle.volume == pytest.approx(n / 2 * R**2 * math.sin(2 * math.pi / n), rel=1e-12)
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (2000, 2))
+    away = np.linalg.norm(points, axis=1) - R
+    assert np.abs(circle.signed_distance(points) - away).max() <= R * (1 - math.cos(math.pi / n)) + 1e-15
+    assert np.array_equal(circle.contains(points, inset=0.05), away <= -0.05)
+    along = np.arange(n) / n
+    comb = [*np.stack([along, 0.1 + 0.8 * (np.arange(n) % 2)], axis=1).tolist(), [1.0, 0.0], [0.0, 0.0]]
+    assert make(Polygon, 2, vertices=comb).volume == pytest.approx(0.5, rel=1e-3)
+    comb[n // 2][0] += 2.5 / n
+    with pytest.raises(ValidationError, match=f"edges after vertices {n // 2 - 1} and {n // 2 + 1} cross"):
+        make(Polygon, 2, vertices=comb)
+    arm = np.stack([np.cos(20 * angle / R), np.sin(20 * angle / R)], axis=1)
+    spiral = [*(arm * (1 + angle)[:, None]).tolist(), *(arm * (1.02 + angle)[:, None])[::-1].tolist()]
+    assert make(Polygon, 2, vertices=spiral).volume == pytest.approx(
+        0.02 * 20 / R * 2 * math.pi * (1.01 + math.pi), 1e-2
+    )
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(4, 130))
+def test_distances_and_crossings_are_those_of_all_edges(seed, n):
+    """One by one: distances to segments, and pairs of segments that solve a + s u = c + t v with s and t in [0, 1]."""
+    rng = np.random.default_rng(seed)
+    vertices, points = rng.random((n, 2)), rng.random((20, 2))
+    u = np.roll(vertices, -1, axis=0) - vertices
+    along = np.clip(np.einsum("pki,ki->pk", points[:, None] - vertices, u) / np.sum(u * u, axis=1), 0, 1)
+    expected = np.linalg.norm(points[:, None] - vertices - along[..., None] * u, axis=2).min(axis=1)
+    assert edge_distances(points, vertices) == pytest.approx(expected, rel=1e-12)
+    # A radial outline is simple; with two corners exchanged it may not be.
+    angle = 2 * math.pi * np.arange(n) / n
+    outline = (0.5 + rng.random((n, 1))) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    first, second = rng.choice(n, 2, replace=False)
+    outline[[first, second]] = outline[[second, first]]
+    u = np.roll(outline, -1, axis=0) - outline
+    i, j = np.triu_indices(n, 2)
+    i, j = i[(i > 0) | (j < n - 1)], j[(i > 0) | (j < n - 1)]
+    s, t = np.linalg.solve(np.stack([u[i], -u[j]], axis=2), (outline[j] - outline[i])[..., None])[..., 0].T
+    cross = bool(np.any((s >= 0) & (s <= 1) & (t >= 0) & (t <= 1)))
+    try:
+        make(Polygon, 2, vertices=outline.tolist())
+    except ValidationError:
+        assert cross
+    else:
+        assert not cross
 
 
 @pytest.mark.parametrize(

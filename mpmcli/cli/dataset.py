@@ -191,6 +191,12 @@ def merge(parts: tuple[Path, ...], output: Path, as_json: bool) -> None:
     metavar="M",
     help="Distance between particles on walls, m; that of the others at the start by default.",
 )
+@click.option(
+    "--features",
+    metavar="NAMES",
+    callback=lambda _context, _option, text: text and tuple(name for name in text.split(",") if name != "none"),
+    help="Material parameters that particles of a GNS export have, with commas, or none; needed if several differ.",
+)
 @click.option("--overwrite", is_flag=True, help="Replace an earlier export in the output directory.")
 @quiet_option
 @json_option

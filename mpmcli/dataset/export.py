@@ -42,6 +42,7 @@ class ExportSettings:
         max_particles: largest number of material particles per trajectory; None for all.
         overwrite: whether an earlier export in `directory` is replaced.
         walls: walls that get particles.
+        features: material parameters that particles of a GNS export have; None for the one that differs.
         wall_spacing: distance between neighbouring wall particles, m; None for that of the material at the start.
     """
 
@@ -53,6 +54,7 @@ class ExportSettings:
     overwrite: bool = False
     walls: Walls = "none"
     wall_spacing: float | None = None
+    features: tuple[str, ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -114,7 +116,9 @@ def export(
         metadata["dataset"] = {name: told[name] for name in ("part", "trajectories", "done", "accepted", "verdicts")}
     if any(each.particle_count < each.source.particle_count for each in chosen):
         metadata["particle_seed"] = SEED
-    form = FORMATS[settings.form](chosen)
+    if settings.features is not None and settings.form != "gns":
+        raise InputError("--features is for --to gns: leave it out.")
+    form = FORMATS[settings.form](chosen, settings.features)
     form.check()
     for each in chosen:
         walls = each.walls

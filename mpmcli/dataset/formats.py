@@ -1,6 +1,7 @@
 """The formats of an export: LagrangeBench and GNS for training code, npz for NumPy, vtkhdf for ParaView."""
 
 import math
+import pickle
 import zipfile
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -26,6 +27,7 @@ from mpmcli.frames.ledger import RIGID
 from mpmcli.output.durable import ask_for
 from mpmcli.output.layout import POSITION
 from mpmcli.output.vtkhdf import VtkhdfWriter, file_size
+from mpmcli.scene.problem import listed
 
 # Entries of a format in metadata.json, and notes for the user.
 Written = tuple[dict[str, Any], list[str]]
@@ -34,8 +36,9 @@ Written = tuple[dict[str, Any], list[str]]
 class Format(ABC):
     """Writes trajectories of one dimension as files of a format."""
 
-    def __init__(self, trajectories: Sequence[SubsampledTrajectory]) -> None:
-        self.trajectories = trajectories
+    def __init__(self, trajectories: Sequence[SubsampledTrajectory], features: tuple[str, ...] | None = None) -> None:
+        """`features` are the material parameters that GNS gets, None for those that differ."""
+        self.trajectories, self._features = trajectories, features
 
     def check(self) -> None:  # noqa: B027
         """Raise an InputError for trajectories that the format cannot store."""
@@ -233,15 +236,32 @@ class Gns(TrainingFormat):
                     "jump there, and particles at them lack neighbours; --to lagrangebench and --to npz take them."
                 )
         super().check()
+        known = [*self._differing]
+        if self._features is None and len(known) > 1:
+            raise InputError(
+                f"{listed(known, 'and')} differ between bodies of one law, and the loader of GNS takes one parameter: "
+                f"give --features {known[0]}, several with commas for a loader whose np.full has the shape (N, m), or "
+                "--features none."
+            )
+        for name in self._features or ():
+            if name not in known:
+                has = f"; {listed(known, 'and')} {'do' if len(known) > 1 else 'does'}" if known else ""
+                raise InputError(f'--features: "{name}" does not differ between bodies of one law{has}.')
+
+    @property
+    def parameters(self) -> list[str]:
+        """Names of the material parameters that particles have."""
+        return self._differing if self._features is None else list(self._features)
 
     @cached_property
-    def parameters(self) -> list[str]:
-        """Names of numeric material parameters that differ between bodies of one law, over all trajectories."""
+    def _differing(self) -> list[str]:
+        """Names of numeric parameters that scenes state differently for bodies of one law, over all trajectories."""
         values: dict[tuple[str, str], set[float]] = {}
         for each in self.trajectories:
             for body in each.source.header.bodies:
                 for name, value in body.material.items():
-                    if isinstance(value, int | float) and math.isfinite(value):
+                    # A modulus that mpmcli has chosen follows from the scene.
+                    if isinstance(value, int | float) and math.isfinite(value) and name not in body.chosen:
                         values.setdefault((str(body.material.get("law")), name), set()).add(float(value))
         return sorted({name for (_, name), different in values.items() if len(different) > 1})
 
@@ -316,10 +336,11 @@ class Npz(Format):
             why = "Some trajectories have fewer than three frames"
         elif any(outruns_periods(each) for each in self.trajectories):
             why = "Particles cross half of a periodic domain between two exported frames"
-        if why:
-            return facts, [f"{why}: metadata.json has no statistics of motion."]
-        statistics, notes = learning_facts(self.trajectories)
-        return facts | statistics, notes
+        try:
+            statistics, notes = ({}, []) if why else learning_facts(self.trajectories)
+        except ValueError:
+            why, statistics, notes = "A trajectory has no particle that is active in three frames", {}, []
+        return facts | statistics, [f"{why}: metadata.json has no statistics of motion."] if why else notes
 
     @staticmethod
     def _arrays(trajectory: SubsampledTrajectory) -> Iterable[tuple[str, np.ndarray]]:
@@ -384,7 +405,20 @@ def write_npz(path: Path, arrays: Iterable[tuple[str, np.ndarray]]) -> None:
         for name, array in arrays:
             # Entries opened by name have the date 1980-01-01.
             with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
-                np.lib.format.write_array(entry, array, allow_pickle=array.dtype == object)
+                if array.dtype == object:
+                    header = np.lib.format.header_data_from_array_1_0(array)
+                    np.lib.format.write_array_header_1_0(entry, header)
+                    _Pickler(entry, protocol=3).dump(array)
+                else:
+                    np.lib.format.write_array(entry, array, allow_pickle=False)
+
+
+class _Pickler(pickle.Pickler):
+    """Pickles arrays by public names: numpy itself writes `numpy._core`, which versions before 1.26 lack."""
+
+    def reducer_override(self, obj: Any) -> Any:
+        """Return how an array is made, and NotImplemented for any other object."""
+        return (np.ndarray, ((0,), "b"), obj.__reduce__()[2]) if isinstance(obj, np.ndarray) else NotImplemented
 
 
 FORMATS: dict[str, type[Format]] = {"lagrangebench": LagrangeBench, "gns": Gns, "npz": Npz, "vtkhdf": Vtkhdf}

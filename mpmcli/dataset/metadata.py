@@ -1,6 +1,6 @@
 """The contents of metadata.json in all formats of an export, with the statistics of motion for training code."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +10,7 @@ from mpmcli import __version__
 from mpmcli.dataset.shard import SPLITS
 from mpmcli.dataset.subsample import SubsampledTrajectory
 from mpmcli.errors import InputError
+from mpmcli.frames.frame import ACTIVE, STATUS
 from mpmcli.output.header import RunHeader, nearest_image
 
 # Neighbours of a particle on the lattice of the start lie at 1 and sqrt(2) spacings, 8 in 2D and 18 in 3D, and the next
@@ -104,8 +105,20 @@ def learning_facts(trajectories: Sequence[SubsampledTrajectory]) -> tuple[dict[s
     chosen = train or trajectories
     headers = [each.source.header for each in chosen]
     periods = [header.period for header in headers]
-    statistics = motion_statistics((each.blocks("position") for each in chosen), periods)
+    statistics = motion_statistics(map(_present, chosen), periods)
     return {name: vector.tolist() for name, vector in statistics.items()}, notes
+
+
+def _present(trajectory: SubsampledTrajectory) -> Iterator[np.ndarray]:
+    """Yield the positions as `blocks` does, nan where a particle is not active: it waits, or has gone."""
+    source, stride, first = trajectory.source, trajectory.stride, 0
+    for block in trajectory.blocks("position"):
+        frames = slice(first * stride, (first + len(block)) * stride, stride)
+        first += len(block)
+        if source.header.comes_and_goes:
+            status = source.read(STATUS, frames, trajectory.particles)
+            block = np.where((status == ACTIVE)[..., None], block, np.nan)
+        yield block
 
 
 def require_alike(trajectories: Sequence[SubsampledTrajectory], form: str) -> None:
@@ -174,7 +187,10 @@ class Moments:
 def motion_statistics(
     trajectories: Iterable[Iterable[np.ndarray]], periods: Sequence[np.ndarray] | None = None
 ) -> dict[str, np.ndarray]:
-    """Return mean and deviation, (d,), m, of x[t+1] - x[t] and its differences; trajectories have equal weights."""
+    """Return mean and deviation, (d,), m, of x[t+1] - x[t] and its differences; trajectories have equal weights.
+
+    Positions that are nan are left out. ValueError: a trajectory has no particle in three consecutive frames.
+    """
     moments = [_of_trajectory(blocks, None if periods is None else periods[k]) for k, blocks in enumerate(trajectories)]
     if not moments:
         raise ValueError("statistics need a trajectory")
@@ -198,14 +214,15 @@ def _of_trajectory(blocks: Iterable[np.ndarray], period: np.ndarray | None) -> t
         velocity, acceleration = _with(velocity, new), _with(acceleration, a)
         before = joined[-2:]
     if velocity is None or acceleration is None:
-        raise ValueError("statistics need three frames of each trajectory")
+        raise ValueError("statistics need a particle in three frames of each trajectory")
     return velocity, acceleration
 
 
 def _with(moments: Moments | None, vectors: np.ndarray) -> Moments | None:
-    if vectors.size == 0:
+    found = vectors[np.isfinite(vectors).all(axis=-1)]
+    if found.size == 0:
         return moments
-    return Moments.of(vectors) if moments is None else moments.merged(Moments.of(vectors))
+    return Moments.of(found) if moments is None else moments.merged(Moments.of(found))
 
 
 def _over_trajectories(moments: Iterable[Moments]) -> tuple[np.ndarray, np.ndarray]:

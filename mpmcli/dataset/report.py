@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import h5py
@@ -31,7 +32,7 @@ from mpmcli.dataset.shard import (
 )
 from mpmcli.errors import InputError, RunError
 from mpmcli.output.checksums import checksum_is_right
-from mpmcli.output.durable import sealed
+from mpmcli.output.durable import sealed, write_text
 from mpmcli.plain_text import counted, markdown_table, one_line, size_text
 from mpmcli.render.picture_file import digest_of
 
@@ -212,15 +213,20 @@ CARD, MONTAGE = "README.md", "montage.png"
 # Marks around the card in README.md, whose other text is its owner's; a part without its end mark is the owner's, too.
 MARKS = b"<!-- card: written by mpmcli -->", b"<!-- end of card -->"
 _MARKED = re.compile(rb"(?s)%b((?!%b).)*?%b\n?" % (MARKS[0], MARKS[0], MARKS[1]))
+# First lines of the front matter; one with other lines is the owner's.
+FRONT = "---", "configs:", "- config_name: default", "  data_files:"
+_FRONT = re.compile(("\\A" + "\n".join(FRONT) + r"\n(?:  - split: \w+\n    path: \S+\n)+---\n+").encode())
 # Bins of a histogram; if there are few distinct values, each is counted separately.
 BINS = 10
 MOST_COUNTED = 6
+# Probability of such ranks by chance below which trajectories left out are said to cluster.
+CLUSTERED = 0.05
 LEVELS = "▁▂▃▄▅▆▇█"
 EMPTY = "·"
 
 
 def write_card(directory: Path) -> Path:
-    """Write the card of a dataset whose trajectories have all been tried, and return its path.
+    """Write the card of a dataset whose trajectories have all been tried, and tables of its splits; return its path.
 
     Its bytes depend on the sweep and the trajectories alone, not on times, machines, interrupts or parts. It shows the
     picture montage.png if the directory contains one. Other text in the file is kept.
@@ -231,7 +237,7 @@ def write_card(directory: Path) -> Path:
     sweep = tomllib.loads(sweep_text)
     base = tomllib.loads((directory / BASE).read_text(encoding="utf-8"))
     included = [row for row in rows if row.accepted]
-    loading = ""
+    tables, loading = split_tables(included), ""
     if included:
         one, d = included[0], len(base["domain"]["size"])
         loading = _LOADING.format(file=one.file, group=group_name(one.number), split=one.split, d=d)
@@ -242,35 +248,66 @@ def write_card(directory: Path) -> Path:
         _contents(directory, included) if included else "No trajectory is included.",
         _counts(facts["count"], rows),
         _left_out([row for row in rows if not row.accepted]),
-        _drawn(sweep, included),
+        _drawn(sweep, rows),
         loading,
         f"Drawn with seed {facts['seed']}; computed with mpmcli {facts['version']}. `sweep.toml` and `base.toml` are "
         "the sweep and its base scene.",
     ]
     try:
-        _put_card(directory / CARD, "\n\n".join(section for section in sections if section).encode())
+        for name, text in tables.items():
+            write_text(directory / name, text)
+        card = "\n\n".join(section for section in sections if section)
+        _put_card(directory / CARD, card.encode(), _front_matter(tables).encode())
     except OSError as error:
         raise RunError(f"{directory / CARD} could not be written ({error.strerror}); the dataset is kept.") from error
     return directory / CARD
 
 
-def _put_card(path: Path, card: bytes) -> None:
-    """Put a card between its marks, or after all other text."""
+def _put_card(path: Path, card: bytes, front: bytes) -> None:
+    """Put a card between its marks, or after all other text, and the front matter first unless there is another."""
     before, marked = path.read_bytes() if path.exists() else b"", b"\n\n".join([MARKS[0], card, MARKS[1]]) + b"\n"
-    text, found = _MARKED.subn(lambda _: marked, before)
+    text, found = _MARKED.subn(lambda _: marked, _FRONT.sub(b"", before))
+    if not found:
+        text = b"\n".join(filter(None, [text, marked]))
     with sealed(path) as temporary:
-        temporary.write_bytes(text if found else b"\n".join(filter(None, [before, marked])))
+        temporary.write_bytes(text if text.startswith(b"---") else front + text)
 
 
 def remove_card(directory: Path) -> None:
-    """Remove the card of a dataset, and its picture if mpmcli has drawn it; README.md stays if it has other text."""
+    """Remove the card of a dataset, its tables and its picture; README.md stays if it has other text."""
     path = directory / CARD
-    if path.exists() and _MARKED.sub(b"", path.read_bytes()).strip():
-        _put_card(path, b"")
+    if path.exists() and _MARKED.sub(b"", _FRONT.sub(b"", path.read_bytes())).strip():
+        _put_card(path, b"", b"")
     else:
         path.unlink(missing_ok=True)
+    for name in SPLITS:
+        (directory / table_name(name)).unlink(missing_ok=True)
     if digest_of(directory / MONTAGE):
         (directory / MONTAGE).unlink()
+
+
+def table_name(split: str) -> str:
+    """Return the name of the file of `split_tables` of a split."""
+    return f"{split}.jsonl"
+
+
+def split_tables(included: Sequence[Row]) -> dict[str, str]:
+    """Return a table of each split that has trajectories, as JSON lines by the name of its file, for `load_dataset`.
+
+    Of files of HDF5 that function makes one table, whatever their splits, and it would take those in quarantine.
+    """
+    found: dict[str, str] = {}
+    for row in sorted(included, key=lambda row: SPLITS.index(row.split)):
+        facts = {name: getattr(row, name) for name in ("number", "file", "frames", "particles", "draws")}
+        name = table_name(row.split)
+        found[name] = found.get(name, "") + json.dumps(facts | {"group": group_name(row.number)}) + "\n"
+    return found
+
+
+def _front_matter(tables: Collection[str]) -> str:
+    """Return the YAML with which a card on Hugging Face begins: the file of each split."""
+    lines = [f"  - split: {name.removesuffix('.jsonl')}\n    path: {name}" for name in tables]
+    return "\n".join([*FRONT, *lines, "---\n\n"]) if lines else ""
 
 
 def first_paragraph(text: str) -> str:
@@ -361,21 +398,24 @@ def _left_out(rows: Sequence[Row]) -> str:
     return "\n".join(["Left out:", "", *lines])
 
 
-def _drawn(sweep: Mapping[str, Any], included: Sequence[Row]) -> str:
-    """Return a table of the varying keys, and of the drawn values of the included trajectories."""
+def _drawn(sweep: Mapping[str, Any], rows: Sequence[Row]) -> str:
+    """Return a table of the varying keys, and of the values drawn, with a line for each key that decides who is in."""
     components: dict[str, DrawnComponent] = {}
-    for row in included:
+    for row in rows:
         for label, source, value in values_of(sweep, json.loads(row.draws)):
-            components.setdefault(label, DrawnComponent(label, source)).add(value)
-    rows = [(f"`{label}`", source, *rest) for label, source, *rest in (one.row for one in components.values())]
-    if not rows:
+            components.setdefault(label, DrawnComponent(label, source)).add(value, row.accepted)
+    if not components or not any(row.accepted for row in rows):
         return ""
-    method = sweep.get("method", "random")
     head = ("key", "drawn from", "min", "mean", "max", "values")
-    return (
+    # What was left out has a column if there is any.
+    head += ("left out",) * (not all(row.accepted for row in rows))
+    told = [(f"`{one.label}`", one.source, *one.row[2 : len(head)]) for one in components.values()]
+    method = sweep.get("method", "random")
+    lines = [
         f"## What varies\n\nWhat the included trajectories have drawn (method: {method}); a histogram has ten bins "
-        f"from min to max.\n\n{markdown_table(head, rows, range(len(head)))}"
-    )
+        f"from the smallest to the largest value drawn.\n\n{markdown_table(head, told, range(len(head)))}"
+    ]
+    return "\n\n".join([*lines, *filter(None, (one.truncation() for one in components.values()))])
 
 
 _LOADING = """\
@@ -391,7 +431,7 @@ position, velocity = trajectory.position, trajectory.velocity    # (T, N, {d}), 
 times, body, draws = trajectory.times, trajectory.body, trajectory.draws
 ```
 
-With h5py alone:
+With h5py alone; `datasets.load_dataset(".")` of Hugging Face has each one's `file`, `group` and `draws`, by split:
 
 ```python
 import h5py
@@ -431,38 +471,58 @@ class DrawnComponent:
 
     def __init__(self, label: str, source: str) -> None:
         self.label, self.source = label, source
-        self._numbers = array("d")
-        self._texts: Counter[str] = Counter()
+        # Of the trajectories left out, and of those included.
+        self._numbers = array("d"), array("d")
+        self._texts: tuple[Counter[str], Counter[str]] = Counter(), Counter()
 
-    def add(self, value: Any) -> None:
-        """Count a value: a finite number, or any other JSON value."""
+    def add(self, value: Any, accepted: bool = True) -> None:
+        """Count a value, a finite number or any other JSON value, of a trajectory that is included or left out."""
         if isinstance(value, int | float) and not isinstance(value, bool):
-            self._numbers.append(value)
+            self._numbers[accepted].append(value)
         else:
-            self._texts[value if isinstance(value, str) else json.dumps(value)] += 1
+            self._texts[accepted][value if isinstance(value, str) else json.dumps(value)] += 1
 
     @property
     def row(self) -> tuple[str, ...]:
-        """Label, source, minimum, mean, maximum and distribution, as text; "" if there is none."""
-        ends = ("", "", "")
-        if self._numbers and not self._texts:
+        """Label, source, minimum, mean, maximum and distribution, and that of values left out; "" if there is none."""
+        ends, numbers = ("", "", ""), self._numbers[True]
+        if numbers and not self._texts[True]:
             # The exact sum is independent of the order.
-            mean = math.fsum(self._numbers) / len(self._numbers)
-            ends = (number_text(min(self._numbers)), number_text(mean), number_text(max(self._numbers)))
+            mean = math.fsum(numbers) / len(numbers)
+            ends = (number_text(min(numbers)), number_text(mean), number_text(max(numbers)))
+        return (self.label, self.source, *ends, self._distribution(True), self._distribution(False))
+
+    def _distribution(self, accepted: bool) -> str:
+        drawn = [*self._numbers[True], *self._numbers[False]]
         # Sorted as numbers; a key that draws texts has few distinct ones.
-        counts = Counter(map(number_text, sorted(self._numbers))) + self._texts
-        repeated = len(counts) < max(len(self._numbers), 2)
-        if (len(counts) <= MOST_COUNTED and repeated) or self._texts:
+        distinct = len({*map(number_text, drawn), *self._texts[True], *self._texts[False]})
+        if (distinct <= MOST_COUNTED and distinct < max(len(drawn), 2)) or any(self._texts):
+            counts = Counter(map(number_text, sorted(self._numbers[accepted]))) + self._texts[accepted]
             told = [f"{value}: {count}" for value, count in list(counts.items())[:MOST_COUNTED]]
-            drawn = ", ".join([*told, "..."] if len(counts) > MOST_COUNTED else told)
-        else:
-            drawn = f"`{histogram(self._numbers)}`"
-        return (self.label, self.source, *ends, drawn)
+            return ", ".join([*told, "..."] if len(counts) > MOST_COUNTED else told)
+        numbers = self._numbers[accepted]
+        return f"`{histogram(numbers, min(drawn), max(drawn))}`" if numbers else ""
+
+    def truncation(self) -> str:
+        """Return a sentence if the values left out rank otherwise than those included (Mann and Whitney), else ""."""
+        gone, kept = self._numbers
+        if not gone or not kept or any(self._texts):
+            return ""
+        from scipy.stats import mannwhitneyu
+
+        found = mannwhitneyu(gone, kept)
+        if not found.pvalue < CLUSTERED:
+            return ""
+        side = "lower" if found.statistic < len(gone) * len(kept) / 2 else "higher"
+        return (
+            f"The trajectories left out have {side} values of `{self.label}` than those included (medians "
+            f"{number_text(median(gone))} and {number_text(median(kept))}; a rank test gives p = {found.pvalue:.2g}): "
+            "the dataset lacks this end of the distribution."
+        )
 
 
-def histogram(values: Sequence[float]) -> str:
-    """Return bars with heights proportional to the counts in equal bins from the smallest to the largest value."""
-    low, high = min(values), max(values)
+def histogram(values: Sequence[float], low: float, high: float) -> str:
+    """Return bars with heights proportional to the counts in equal bins between two values."""
     counts = [0] * BINS
     for value in values:
         counts[min(BINS - 1, int(BINS * ((value - low) / (high - low))))] += 1

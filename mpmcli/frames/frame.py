@@ -5,6 +5,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 STATUS = "status"
+# Status of a particle: waiting for its emitter, active, retired beyond an open face, or permanently blocked.
+WAITING, ACTIVE, RETIRED, BLOCKED = range(4)
 
 
 @dataclass(frozen=True)
@@ -20,7 +22,7 @@ class Frame:
         body: (n,) int32, index into the scene's bodies.
         material: (n,) int32, index into the run's list of laws.
         fields: further arrays of the scene's `output.fields`, (n,) or (n, k), by name; and if particles come and go,
-            `STATUS`, (n,) int8: 0 waiting, 1 present, 2 gone, 3 kept out.
+            `STATUS`, (n,) int8: WAITING, ACTIVE, RETIRED or BLOCKED.
         id: (n,), number of each particle if only some are in the frame; None if row i is particle i.
     """
 
@@ -37,7 +39,7 @@ class Frame:
     @property
     def present(self) -> np.ndarray | None:
         """Whether each particle is present, neither waiting nor gone, (n,) bool; None if all always are."""
-        return self.fields[STATUS] == 1 if STATUS in self.fields else None
+        return self.fields[STATUS] == ACTIVE if STATUS in self.fields else None
 
     @property
     def of_present(self) -> "Frame":

@@ -131,6 +131,7 @@ class _StoredHeader(_Facts):
     bodies: tuple[str, ...] = ()
     volumes: tuple[float | None, ...] = ()
     emitter_volumes: tuple[float | None, ...] = ()
+    chosen: tuple[tuple[str, ...], ...] = ()
     contacts: tuple[tuple[str, str], ...] = ()
     materials: tuple[str, ...] = ()
     laws: tuple[LawHeader, ...] = ()
@@ -141,12 +142,16 @@ class _StoredHeader(_Facts):
 
 @dataclass(frozen=True)
 class BodyHeader:
-    """A body of the scene: `material` is its table, `volume` in m^3 (m^2 in 2D); unknown entries are {} or None."""
+    """A body of the scene: `material` is its table, `volume` in m^3 (m^2 in 2D); unknown entries are {} or None.
+
+    `chosen` are the parameters of the material that the scene left "auto".
+    """
 
     name: str
     material: Mapping[str, Any]
     volume: float | None
     particles_per_cell: float
+    chosen: tuple[str, ...] = ()
 
     @property
     def density(self) -> float | None:
@@ -219,6 +224,9 @@ class RunHeader:
         known = not any(
             body.shape.files or body.deformation is not None or body.initial_pressure for body in scene.bodies
         )
+        chosen = [
+            sorted({*type(one).model_fields} - one.model_fields_set) for one in (b.material for b in scene.sources)
+        ]
         emitted = [sheets_of(emitter, scene) for emitter in scene.emitters]
         return cls.read(
             {
@@ -238,6 +246,7 @@ class RunHeader:
                 "scene": text,
             }
             | ({"emitter_volumes": [sheets.particles * sheets.volume for sheets in emitted]} if emitted else {})
+            | ({"chosen": chosen} if any(chosen) else {})
             | ({"contacts": [list(pair) for pair in scene.contact_pairs]} if scene.contact_pairs else {})
         )
 
@@ -382,6 +391,7 @@ def _bodies(facts: _StoredHeader) -> tuple[BodyHeader, ...]:
     tables = [*scene.bodies, *scene.emitters]
     # The volume of an emitter is that of all its particles, which does not follow from its shape.
     volumes = [*(facts.volumes or [None] * len(scene.bodies)), *facts.emitter_volumes]
+    chosen = facts.chosen if len(facts.chosen) == len(names) else [()] * len(names)
     tables = tables if len(tables) == len(names) else [_Body()] * len(names)
     volumes = volumes if len(volumes) == len(names) else [None] * len(names)
     return tuple(
@@ -390,8 +400,9 @@ def _bodies(facts: _StoredHeader) -> tuple[BodyHeader, ...]:
             table.material,
             table.volume(d) if volume is None else volume,
             table.particles_per_cell or usual_particles_per_cell(d),
+            own,
         )
-        for name, table, volume in zip(names, tables, volumes, strict=True)
+        for name, table, volume, own in zip(names, tables, volumes, chosen, strict=True)
     )
 
 

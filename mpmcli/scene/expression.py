@@ -1,5 +1,7 @@
 """Expressions as trees of named quantities: value, bounds and derivative; one table row for each function.
 
+A derivative refers to parts of its tree, so that a part may occur many times; every walk visits it once (`_folded`).
+
 `expression_reader` reads them from text; `solver.drive.expressions` has each function in a kernel, by the same name.
 
 Bounds follow from interval arithmetic (Moore, Kearfott and Cloud 2009, ch. 2-5). They contain every finite value up to
@@ -9,10 +11,11 @@ differences are not used: they are wrong within a step of a singular point, else
 """
 
 import math
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import reduce
-from typing import Literal
+from functools import cached_property, reduce
+from typing import Any, Literal
 
 import numpy as np
 
@@ -49,12 +52,30 @@ class Name:
     name: str
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class Apply:
-    """An operator or a function, and its arguments."""
+    """An operator or a function, and its arguments; equal to itself alone."""
 
     function: str
     arguments: tuple["Tree", ...]
+
+    @cached_property
+    def names(self) -> frozenset[str]:
+        """The names in the arguments."""
+        return frozenset().union(*map(names_in, self.arguments))
+
+    @cached_property
+    def order(self) -> tuple["Tree", ...]:
+        """Itself and the nodes below it, each once, arguments before their function."""
+        found: dict[int, Tree] = {}
+        waiting: list[Tree] = [self]
+        while waiting:
+            node = waiting[-1]
+            missing = [a for a in node.arguments if id(a) not in found] if isinstance(node, Apply) else []
+            waiting += missing[::-1]
+            if not missing:
+                found[id(waiting.pop())] = node
+        return tuple(found.values())
 
 
 Tree = Number | Name | Apply
@@ -82,47 +103,56 @@ class Expression:
 def evaluate(tree: Tree, values: Mapping[str, np.ndarray | float]) -> np.ndarray:
     """Return the value of a tree in float64, from the values of its names."""
     with np.errstate(all="ignore"):
-        return _evaluate(tree, values)
-
-
-def _evaluate(tree: Tree, values: Mapping[str, np.ndarray | float]) -> np.ndarray:
-    if isinstance(tree, Number):
-        return np.float64(tree.value)
-    if isinstance(tree, Name):
-        return np.asarray(values[tree.name], dtype=np.float64)
-    return _function(tree).compute(*[_evaluate(argument, values) for argument in tree.arguments])
+        return _folded(
+            tree, np.float64, lambda name: np.asarray(values[name], dtype=np.float64), lambda f: _function(f).compute
+        )
 
 
 def bounds_of(tree: Tree, ranges: Mapping[str, Interval]) -> Interval:
     """Return bounds on a tree where each name lies within its range; an unknown end is infinite."""
     with np.errstate(all="ignore"):
-        low, high = _bounds(tree, ranges)
+        low, high = _folded(
+            tree, lambda value: (np.float64(value),) * 2, ranges.__getitem__, lambda f: _function(f).bounds
+        )
     return _known(*np.broadcast_arrays(np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)))
-
-
-def _bounds(tree: Tree, ranges: Mapping[str, Interval]) -> Interval:
-    if isinstance(tree, Number):
-        return np.float64(tree.value), np.float64(tree.value)
-    if isinstance(tree, Name):
-        return ranges[tree.name]
-    return _function(tree).bounds(*[_bounds(argument, ranges) for argument in tree.arguments])
 
 
 def derivative(tree: Tree, name: str) -> Tree:
     """Return the partial derivative of a tree by a name."""
-    if isinstance(tree, Name):
-        return ONE if tree.name == name else ZERO
-    if isinstance(tree, Number) or kind_of(tree) == "truth":
-        return ZERO
-    slopes = [derivative(argument, name) for argument in tree.arguments]
-    return ZERO if all(slope == ZERO for slope in slopes) else _function(tree).slope(tree, *slopes)
+
+    def rule(f: Apply) -> Callable[..., Tree]:
+        if kind_of(f) == "truth":
+            return lambda *_: ZERO
+        return lambda *slopes: ZERO if all(slope == ZERO for slope in slopes) else _function(f).slope(f, *slopes)
+
+    return _folded(tree, lambda _: ZERO, lambda own: ONE if own == name else ZERO, rule)
+
+
+def _folded(
+    tree: Tree, number: Callable[[float], Any], name: Callable[[str], Any], rule: Callable[[Apply], Callable[..., Any]]
+) -> Any:
+    """Return what the rules make of a tree: of a number, of a name, and of a function, from that of its arguments."""
+    found: dict[int, Any] = {}
+    order = tree.order if isinstance(tree, Apply) else (tree,)
+    left = Counter(id(a) for node in order if isinstance(node, Apply) for a in node.arguments)
+    for node in order:
+        if isinstance(node, Apply):
+            found[id(node)] = rule(node)(*[found[id(a)] for a in node.arguments])
+            # A result may be an array over all particles, and is kept until its last use.
+            for a in node.arguments:
+                left[id(a)] -= 1
+                if not left[id(a)]:
+                    del found[id(a)]
+        else:
+            found[id(node)] = number(node.value) if isinstance(node, Number) else name(node.name)
+    return found[id(tree)]
 
 
 def names_in(tree: Tree) -> frozenset[str]:
     """Return the names in a tree."""
-    if isinstance(tree, Name):
-        return frozenset([tree.name])
-    return frozenset().union(*(names_in(a) for a in tree.arguments)) if isinstance(tree, Apply) else frozenset()
+    if isinstance(tree, Apply):
+        return tree.names
+    return frozenset([tree.name] if isinstance(tree, Name) else [])
 
 
 def kind_of(tree: Tree) -> Kind:
@@ -327,18 +357,19 @@ def _power_slope(f: Tree, a: Tree, b: Tree, da: Tree, db: Tree) -> Tree:
 
 def _clamp_slope(f: Apply, *slopes: Tree) -> Tree:
     x, low, high = f.arguments
-    risen = _extreme(">=", (x, low), slopes[:2])
-    return _extreme("<=", (Apply("max", (x, low)), high), (risen, slopes[2]))
+    risen = _extreme("max", (x, low), slopes[:2])
+    return _extreme("min", (risen[0], high), (risen[1], slopes[2]))[1]
 
 
-def _extreme(sign: str, values: tuple[Tree, ...], slopes: tuple[Tree, ...]) -> Tree:
-    """Return the slope of the extreme of some values: the slope of the chosen value."""
-    value, slope = values[0], slopes[0]
-    for other, its_slope in zip(values[1:], slopes[1:], strict=True):
-        chosen = Apply(sign, (value, other))
-        slope = slope if slope == its_slope else Apply("if", (chosen, slope, its_slope))
-        value = Apply("if", (chosen, value, other))
-    return slope
+def _extreme(name: str, values: tuple[Tree, ...], slopes: tuple[Tree, ...]) -> tuple[Tree, Tree]:
+    """Return the largest or the smallest of some values, by "max" or "min", and its slope: that of the chosen value."""
+    if len(values) == 1:
+        return values[0], slopes[0]
+    # By halves, because a tree's depth is limited where it is compiled.
+    half = len(values) // 2
+    (a, da), (b, db) = _extreme(name, values[:half], slopes[:half]), _extreme(name, values[half:], slopes[half:])
+    chosen = Apply(">=" if name == "max" else "<=", (a, b))
+    return Apply(name, (a, b)), da if da == db else Apply("if", (chosen, da, db))
 
 
 # Rows
@@ -362,11 +393,11 @@ def _truth_of(compute: Callable[..., np.ndarray], bounds: Callable, count: int =
     return Function(compute, bounds, None, count, count, "truth")
 
 
-def _extreme_row(choose: np.ufunc, sign: str) -> Function:
+def _extreme_row(choose: np.ufunc, name: str) -> Function:
     return Function(
         lambda *values: reduce(choose, values),
         _extreme_of(choose),
-        lambda f, *slopes: _extreme(sign, f.arguments, slopes),
+        lambda f, *slopes: _extreme(name, f.arguments, slopes)[1],
         least=2,
         most=MANY,
     )
@@ -426,8 +457,8 @@ FUNCTIONS: dict[str, Function] = {
     "ceil": _of_one(np.ceil, _flat),
     "sign": _of_one(np.sign, _flat),
     "step": _of_one(_step, _flat),
-    "min": _extreme_row(np.minimum, "<="),
-    "max": _extreme_row(np.maximum, ">="),
+    "min": _extreme_row(np.minimum, "min"),
+    "max": _extreme_row(np.maximum, "max"),
     "clamp": Function(
         lambda x, low, high: np.minimum(np.maximum(x, low), high),
         lambda x, low, high: _smallest(_largest(x, low), high),

@@ -35,6 +35,7 @@ MOST_CHARACTERS = 2000
 MOST_NESTED = 60
 TOO_DEEP = f"is nested more than {MOST_NESTED} deep, each term of a sum counted; write it shorter"
 MOST_EXPANDED = 20_000
+MOST_NODES = 500
 
 _BINARY = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/", ast.Mod: "%", ast.Pow: "**"}
 _COMPARED = {ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!="}
@@ -121,6 +122,10 @@ class _Reader:
         tree = self._number(node, 0)
         if isinstance(tree, Apply) and not names_in(tree):
             raise ExpressionError(f'is not finite: "{_cut(self.source)}" divides by zero or is out of range')
+        if isinstance(tree, Apply) and len(tree.order) > MOST_NODES:
+            raise ExpressionError(
+                f"is too large: {len(tree.order)} numbers, names, operators and functions, {MOST_NODES} at most"
+            )
         return tree
 
     def _number(self, node: ast.expr, depth: int) -> Tree:

@@ -150,6 +150,9 @@ def parse_scene(
             others = reaching(body, scene)
             bounds = whole if len(others) == len(scene.sources) else scene_bounds(scene, others)
             material, sentences = body.material.resolve(bounds)
+            # Then `model_fields_set` lacks what was chosen here, and nothing else.
+            material.model_fields_set.update(type(material).model_fields)
+            material.model_fields_set.difference_update(name for name, value in body.material if value == "auto")
             changes: dict[str, object] = {"material": material}
             if table == "bodies":
                 changes["particles_per_cell"] = points_per_cell(body, scene.domain.spacing)

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from pydantic import Field, PrivateAttr, ValidationInfo, model_validator
 
-from mpmcli.scene.points import GeometryFileError, file_version, read_geometry, scene_file
+from mpmcli.scene.points import GeometryFileError, distinct_rows, file_version, read_geometry, scene_file
 from mpmcli.scene.primitives import Solid, grid_points, rotation
 from mpmcli.scene.quantity import Axis, Number, Positive, Table, Vector, flaw, place_text
 
@@ -115,7 +115,7 @@ class ClosedSurface:
 
         edge = _FINE * float(np.ptp(self.bounds(), axis=0).max())
         points = np.array(self._vtk.subdivide_adaptive(max_edge_len=edge, max_n_passes=20).points)
-        return KDTree(points[np.unique(np.floor(points / edge), axis=0, return_index=True)[1]])
+        return KDTree(points[distinct_rows(np.floor(points / edge))[0]])
 
     def crossings(self, lines: np.ndarray) -> Crossings:
         """Return where lines along z at some x, y, (n, 2), meet the surface; n and the crossings must fit in memory.
@@ -179,7 +179,7 @@ class _Raster:
         flat = bins[:, 0] * self.count + bins[:, 1]
         order = np.argsort(flat, kind="stable")
         self.listed = triangle[order]
-        self.starts = np.searchsorted(flat[order], np.arange(self.count**2 + 1))
+        self.starts = np.append(0, np.cumsum(np.bincount(flat, minlength=self.count**2)))
 
     def bins(self, places: np.ndarray) -> np.ndarray:
         return np.clip((places - self.lower) / self.width, 0, self.count - 1).astype(np.int64)
@@ -216,21 +216,20 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
         raise GeometryFileError(str(error) or "it is not a readable mesh (STL, OBJ, PLY and VTU are)") from None
     if not len(found.triangles):
         raise GeometryFileError("it holds no triangle")
-    if not np.isfinite(found.vertices[np.unique(found.triangles)]).all():
+    if not np.isfinite(found.vertices).all(axis=1)[found.triangles].all():
         raise GeometryFileError("it holds a vertex that is not finite")
-    vertices, which = np.unique(found.vertices, axis=0, return_inverse=True)
-    triangles = which.reshape(-1)[found.triangles]
+    first, which = distinct_rows(found.vertices)
+    vertices, triangles = found.vertices[first], which[found.triangles]
     # Merging turns some triangles into edges.
     flat = (triangles == np.roll(triangles, 1, axis=1)).any(axis=1)
-    used, triangles = np.unique(triangles[~flat], return_inverse=True)
-    return vertices[used], triangles.reshape(-1, 3)
+    used = np.bincount(triangles[~flat].ravel(), minlength=len(vertices)) > 0
+    return vertices[used], (np.cumsum(used) - 1)[triangles[~flat]]
 
 
 def _closed(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return a surface with its triangles facing outwards; raise an error if it is not closed."""
     directed = np.concatenate([triangles[:, [k, (k + 1) % 3]] for k in range(3)])
-    edges, which = np.unique(np.sort(directed, axis=1), axis=0, return_inverse=True)
-    which = which.reshape(-1)
+    edges, which = distinct_rows(np.sort(directed, axis=1))
     uses = np.bincount(which, minlength=len(edges))
     if odd := int(np.sum(uses % 2)):
         raise GeometryFileError(f"its surface is open: {odd} of {len(edges)} edges have a triangle on one side only")

@@ -1,6 +1,6 @@
 """Points and triangles from a file, and bodies given by points, each of which is a particle.
 
-The suffix selects the reader: CSV and NPY here; STL, OBJ and PLY by trimesh; all others by PyVista. VTK ends the
+The suffix selects the reader: text, NPY and NPZ here; OBJ, OFF, PLY and STL by trimesh; others by PyVista. VTK ends the
 process at a truncated binary PLY; trimesh raises. trimesh refuses a PLY with faces of different lengths; meshio reads
 it.
 """
@@ -22,8 +22,11 @@ from mpmcli.scene.primitives import Solid
 from mpmcli.scene.problem import hint_at, listed, quoted
 from mpmcli.scene.quantity import AXES, Positive, Table, Vector, flaw, scene_dimension
 
-# Suffixes of files that trimesh reads.
-_BY_TRIMESH = (".obj", ".ply", ".stl")
+# Suffixes of files that trimesh reads, and those that PyVista reads: each file is complete, so that one digest covers
+# it. No other file is opened: .pvd, .pvtu, .vtm and more name further files, a pickle runs code, and some readers end
+# the process.
+_BY_TRIMESH = (".obj", ".off", ".ply", ".stl")
+_BY_VTK = (".glb", ".mesh", ".msh", ".vti", ".vtk", ".vtkhdf", ".vtp", ".vtr", ".vts", ".vtu")
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +70,9 @@ def absence(path: Path) -> str:
 
 def read_geometry(path: Path) -> Geometry:
     """Return the points and the triangles in a file, or raise a GeometryFileError."""
+    if path.suffix.lower() not in _BY_TRIMESH + _BY_VTK:
+        known = listed([*_BY_TRIMESH, *_BY_VTK], "and")
+        raise GeometryFileError(f"the files that are read are {known}; save it as one of these, such as VTU")
     if fault := absence(path):
         raise GeometryFileError(fault)
     try:
@@ -77,6 +83,20 @@ def read_geometry(path: Path) -> Geometry:
     # Readers raise almost any exception at a damaged file; meshio even ends the process.
     except (Exception, SystemExit):
         raise GeometryFileError from None
+
+
+def distinct_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the first of each distinct row of (n, k), k > 1, in the order of their values, and which each row is.
+
+    By integer keys, since `np.unique` of rows compares them one by one: ten times as long.
+    """
+    first = which = np.zeros(len(rows), np.int64)
+    for k, column in enumerate(rows.T):
+        values, here = np.unique(column, return_inverse=True)
+        which = which * len(values) + here
+        if k > 0:
+            _, first, which = np.unique(which, return_index=True, return_inverse=True)
+    return first, which
 
 
 def _by_trimesh(path: Path) -> Geometry:
@@ -100,9 +120,13 @@ def _by_trimesh(path: Path) -> Geometry:
     if triangles.size and not 0 <= triangles.min() <= triangles.max() < len(vertices):
         raise ValueError("a corner is no vertex")
     # Corners of STL, and those of OBJ that have several texture coordinates, are one point.
-    first = np.unique(vertices, axis=0, return_index=True)[1]
-    points = vertices if path.suffix.lower() == ".ply" else vertices[np.sort(first)]
-    return Geometry(points, vertices, np.array(triangles))
+    first, _ = distinct_rows(vertices)
+    if path.suffix.lower() != ".ply":
+        return Geometry(vertices[np.sort(first)], vertices, np.array(triangles))
+    stored = found.metadata.get("_ply_raw", {}).get("vertex", {}).get("data", {})
+    names = stored if isinstance(stored, dict) else stored.dtype.names or ()
+    arrays = {name: np.asarray(stored[name], np.float64).reshape(len(vertices), -1)[:, 0] for name in names}
+    return Geometry(vertices, vertices, np.array(triangles), arrays)
 
 
 def _by_vtk(path: Path) -> Geometry:
@@ -146,30 +170,32 @@ def _by_vtk(path: Path) -> Geometry:
     return Geometry(points, vertices, corners, arrays)
 
 
-TABLES = (".csv", ".npy")
+# Readers of tables by suffix, and how programs name the columns of positions, axis by axis.
+_TABLES = (".csv", ".npy", ".npz", ".txt", ".xyz")
+_POSITIONS = ("{axis}", "{AXIS}", "Points:{k}", "Points_{k}", "points:{k}", "position:{k}")
 
 
 def read_points(path: Path, d: int, velocity: str | Sequence[str] | None) -> tuple[np.ndarray, np.ndarray | None]:
     """Return the points in a file, (n, d), and the requested velocities, (n, d), or None.
 
-    The file is a CSV whose first line names the columns, x, y (and z) among them; an NPY of named columns, or of d or 2
-    d unnamed ones, x, y, z, vx, vy, vz; or a file that `read_geometry` reads. A GeometryFileError reports a fault.
-    `velocity` names the d columns of a table, or an array of a file that PyVista reads.
+    The file is a CSV or TXT whose first line names the columns, `_POSITIONS` among them; an XYZ or NPY without names,
+    of d, 3 or 2 d columns x, y, z, vx, vy, vz; an NPZ, or an NPY of named columns; or a file that `read_geometry`
+    reads. A GeometryFileError reports a fault. `velocity` names d columns, or an array of vectors.
     """
     if fault := absence(path):
         raise GeometryFileError(fault)
-    table = path.suffix.lower() in TABLES
-    fits = velocity is None or (
-        len(velocity) == d and not isinstance(velocity, str) if table else isinstance(velocity, str)
-    )
-    if not fits:
-        right = (
-            f"{d} columns, such as [{', '.join(quoted(_names(d)[d:]))}]" if table else 'an array, such as "velocity"'
-        )
-        raise GeometryFileError(f"velocity must name {right}")
-    if table:
-        columns = _csv(path) if path.suffix.lower() == ".csv" else _npy(path, d)
-        found = _chosen(columns, AXES[:d]), None if velocity is None else _chosen(columns, velocity)
+    suffix = path.suffix.lower()
+    if not isinstance(velocity, str | None) and len(velocity) != d:
+        raise GeometryFileError(f"velocity must name {d} columns, such as [{', '.join(quoted(_names(d)[d:]))}]")
+    if suffix in _TABLES:
+        columns = _npy(path, d) if suffix == ".npy" else _npz(path) if suffix == ".npz" else _text(path, d)
+        # The components of an array are columns `name:0`, `name:1`, as ParaView writes them.
+        names = [f"{velocity}:{k}" for k in range(d)] if isinstance(velocity, str) else velocity
+        if isinstance(velocity, str) and not {*names} <= {*columns}:
+            raise GeometryFileError(f"velocity must name {d} columns, such as [{', '.join(quoted(_names(d)[d:]))}]")
+        ways = [[way.format(axis=AXES[k], AXIS=AXES[k].upper(), k=k) for k in range(d)] for way in _POSITIONS]
+        place = next((way for way in ways if {*way} <= {*columns}), ways[0])
+        found = _chosen(columns, place), None if names is None else _chosen(columns, names)
     else:
         found = _data_set(path, d, velocity)
     for values in found:
@@ -200,21 +226,61 @@ def _is_number(word: str) -> bool:
     return True
 
 
-def _csv(path: Path) -> dict[str, np.ndarray]:
+def _text(path: Path, d: int) -> dict[str, np.ndarray]:
+    """Read columns of text, between commas, semicolons or white space; a first line of names may begin with #."""
     try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            rows = csv.reader(file)
-            names = [name.strip() for name in next(rows, [])]
-            lines = [(rows.line_num, row) for row in rows if row]
+        lines = [line.strip() for line in path.read_text(encoding="utf-8-sig").splitlines()]
+        # The last comment before the numbers names the columns if no other line does.
+        first = next((k for k, line in enumerate(lines) if line and not line.startswith("#")), len(lines))
+        told = [line.lstrip("# ") for line in lines[:first] if line]
+        head = lines[first] if first < len(lines) else ""
+        sign = next((sign for sign in ";,\t" if sign in (head or "".join(told[-1:]))), None)
+        rows = [(k, _words(line, sign)) for k, line in enumerate(lines, 1) if line and not line.startswith("#")]
     except (UnicodeDecodeError, csv.Error, OSError):
         raise GeometryFileError("it is not text with comma-separated values") from None
-    if not names or any(_is_number(name) for name in names):
+    if path.suffix.lower() == ".xyz" and head.isdigit():
+        # The number of atoms, a comment, and lines of an element and its place.
+        rows = [(k, words[1:]) for k, words in rows if k > first + 2]
+    width = len(rows[0][1]) if rows else 0
+    if rows and not any(map(_is_number, rows[0][1])):
+        names, rows = rows[0][1], rows[1:]
+    elif told and len(_words(told[-1], sign)) == width and not any(map(_is_number, _words(told[-1], sign))):
+        names = _words(told[-1], sign)
+    elif path.suffix.lower() == ".xyz" and width in (d, 3, 2 * d, 6):
+        names = [f"{v}{axis}" for v in ("", "v") for axis in AXES[: d if width in (d, 2 * d) else 3]][:width]
+    else:
         raise GeometryFileError("its first line must name the columns, such as x,y,z")
-    for line, row in lines:
+    for line, row in rows:
         if len(row) != len(names) or not all(map(_is_number, row)):
             raise GeometryFileError(f"line {line} must hold {len(names)} numbers, one for each column")
-    values = np.array([row for _, row in lines], dtype=np.float64).reshape(-1, len(names))
+    values = np.array([row for _, row in rows], dtype=np.float64).reshape(-1, len(names))
     return dict(zip(names, values.T, strict=True))
+
+
+def _words(line: str, sign: str | None) -> list[str]:
+    """Return the words of a line between separators, None for white space; beside semicolons a comma is a point."""
+    if sign is None:
+        return line.split()
+    found = [word.strip() for word in next(csv.reader([line], delimiter=sign))]
+    return [word.replace(",", ".") for word in found] if sign == ";" else found
+
+
+def _npz(path: Path) -> dict[str, np.ndarray]:
+    """Read the arrays of one number or one vector per point, the latter as columns `name:0`, `name:1`, ..."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file}
+    except Exception:
+        raise GeometryFileError("it is not a file of numpy arrays") from None
+    columns: dict[str, np.ndarray] = {}
+    for name, array in arrays.items():
+        if array.dtype.kind in "fiu" and array.ndim in (1, 2):
+            vectors = array.reshape(len(array), -1).astype(np.float64)
+            columns |= {name if array.ndim == 1 else f"{name}:{k}": column for k, column in enumerate(vectors.T)}
+    if len({len(column) for column in columns.values()}) > 1:
+        shapes = listed([f"{name} {array.shape}" for name, array in arrays.items()], "and")
+        raise GeometryFileError(f"its arrays must have a row for each point; they are {shapes}")
+    return columns
 
 
 def _npy(path: Path, d: int) -> dict[str, np.ndarray]:
@@ -233,19 +299,22 @@ def _npy(path: Path, d: int) -> dict[str, np.ndarray]:
     return dict(zip(_names(d), found.astype(np.float64).T, strict=False))
 
 
-def _data_set(path: Path, d: int, velocity: str | None) -> tuple[np.ndarray, np.ndarray | None]:
+def _data_set(path: Path, d: int, velocity: str | Sequence[str] | None) -> tuple[np.ndarray, np.ndarray | None]:
     try:
         found = read_geometry(path)
-    except GeometryFileError:
-        raise GeometryFileError("it is not a readable file of points (CSV, NPY, PLY and VTU are)") from None
+    except GeometryFileError as error:
+        said = str(error) or "it is not a readable file of points (CSV, XYZ, NPY, NPZ, PLY and VTU are)"
+        raise GeometryFileError(said) from None
     if not len(found.points):
         raise GeometryFileError("it holds no point")
     position = _in_plane(found.points, d, "points")
     if velocity is None:
         return position, None
-    if velocity not in found.arrays:
+    for name in {*([velocity] if isinstance(velocity, str) else velocity)} - {*found.arrays}:
         known = listed(quoted(list(found.arrays)), "and") if found.arrays else "none"
-        raise GeometryFileError(f'its points have no array "{velocity}"; they have {known}')
+        raise GeometryFileError(f'its points have no array "{name}"; they have {known}')
+    if not isinstance(velocity, str):
+        return position, np.stack([np.array(found.arrays[name], np.float64).reshape(-1) for name in velocity], axis=1)
     values = np.array(found.arrays[velocity], dtype=np.float64)
     if values.ndim != 2 or values.shape[1] not in (d, 3):
         raise GeometryFileError(f'its array "{velocity}" must have {d} numbers for each point')
@@ -276,7 +345,7 @@ class Cloud:
 class Points(Table, Solid):
     """Points from a file, used as the particles of the body."""
 
-    file: str = Field(description="The file, relative to the scene: CSV, NPY, PLY, VTU, ...")
+    file: str = Field(description="The file, relative to the scene: CSV, XYZ, NPY, NPZ, PLY, VTU, ...")
     spacing: Positive | None = Field(
         None, description="Distance between neighbours, m; its square or cube is the volume of a particle."
     )
@@ -285,8 +354,8 @@ class Points(Table, Solid):
     )
     velocity: str | tuple[str, ...] | None = Field(
         None,
-        description='Velocities in the file, added to that of the body: names of columns, such as ["vx", "vy"], of '
-        "CSV and NPY, or the name of an array of VTU, VTP and VTK. Default: none.",
+        description='Velocities in the file, added to that of the body: names of columns, such as ["vx", "vy"], or the '
+        "name of an array of vectors. Default: none.",
     )
     scale: Positive = Field(1.0, description="Metres per unit of the file; velocities are taken as they are.")
     translate: Vector = Field(

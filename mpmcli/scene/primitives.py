@@ -216,12 +216,43 @@ def rotation(axis: Sequence[float], angle: float) -> np.ndarray:
     return np.eye(3) + math.sin(angle) * cross + (1 - math.cos(angle)) * (cross @ cross)
 
 
+# Edges of a polygon up to which the distance to each of them is computed.
+_FEW_EDGES = 100
+
+
 def edge_distances(points: np.ndarray, vertices: np.ndarray) -> np.ndarray:
     """Return the distance of each point, (n, 2), from the outline of a polygon, (k, 2): (n,), m."""
+    return np.sqrt(_edge_squares(points, vertices))
+
+
+def _edge_squares(points: np.ndarray, vertices: np.ndarray) -> np.ndarray:
+    """Return the squares of the distances of points from an outline, m^2."""
+    ahead = np.roll(vertices, -1, axis=0)
+    if len(vertices) > _FEW_EDGES:
+        return _located_squares(points, vertices, ahead)
     nearest = np.full(len(points), np.inf)
-    for a, b in zip(vertices, np.roll(vertices, -1, axis=0), strict=True):
-        nearest = np.minimum(nearest, distance_to_segment(points, a, b))
+    for a, b in zip(vertices, ahead, strict=True):
+        t = np.clip((points - a) @ (b - a) / np.dot(b - a, b - a), 0.0, 1.0)
+        nearest = np.minimum(nearest, np.sum((points - a - t[:, None] * (b - a)) ** 2, axis=1))
     return nearest
+
+
+def _located_squares(points: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
+    import pyvista as pv
+    from vtkmodules.vtkCommonCore import reference
+    from vtkmodules.vtkCommonDataModel import vtkStaticCellLocator
+
+    corners = np.pad(np.stack([starts, ends], axis=1).reshape(-1, 2), ((0, 0), (0, 1)))
+    lines = pv.line_segments_from_points(corners)
+    locator = vtkStaticCellLocator()
+    locator.SetDataSet(lines)
+    locator.BuildLocator()
+    found = np.empty(len(points))
+    nearest, cell, part, square = [0.0, 0.0, 0.0], reference(0), reference(0), reference(0.0)
+    for k, (x, y) in enumerate(points.tolist()):
+        locator.FindClosestPoint((x, y, 0.0), nearest, cell, part, square)
+        found[k] = square.get()
+    return found
 
 
 class Polygon(Table, Solid):
@@ -250,18 +281,21 @@ class Polygon(Table, Solid):
 
     def contains(self, points: np.ndarray, inset: float = 0.0) -> np.ndarray:
         # A point is inside when a ray from it along x crosses the edges an odd number of times.
-        x, y = points[:, 0], points[:, 1]
-        inside = np.zeros(len(points), dtype=bool)
-        near = np.zeros(len(points), dtype=bool)
+        order = np.argsort(points[:, 1], kind="stable")
+        x, y = points[order].T
+        crossed = np.zeros(len(points), dtype=bool)
         vertices = np.array(self.vertices)
-        for a, b in zip(vertices, np.roll(vertices, -1, axis=0), strict=True):
-            crossing = (a[1] > y) != (b[1] > y)
-            if a[1] != b[1]:
-                inside ^= crossing & (x < a[0] + (y - a[1]) * (b[0] - a[0]) / (b[1] - a[1]))
-            if inset > 0:
-                t = np.clip((points - a) @ (b - a) / np.dot(b - a, b - a), 0.0, 1.0)
-                near |= np.sum((points - a - t[:, None] * (b - a)) ** 2, axis=1) < inset**2
-        return inside & ~near
+        ahead = np.roll(vertices, -1, axis=0)
+        # Those at heights of each edge, without its upper end.
+        first, last = (np.searchsorted(y, side(vertices[:, 1], ahead[:, 1])) for side in (np.minimum, np.maximum))
+        for k in np.flatnonzero(first < last):
+            some, a, b = slice(first[k], last[k]), vertices[k], ahead[k]
+            crossed[some] ^= x[some] < a[0] + (y[some] - a[1]) * (b[0] - a[0]) / (b[1] - a[1])
+        inside = np.empty(len(points), dtype=bool)
+        inside[order] = crossed
+        if inset > 0:
+            inside[inside] = _edge_squares(points[inside], vertices) >= inset**2
+        return inside
 
     def signed_distance(self, points: np.ndarray) -> np.ndarray:
         distance = edge_distances(points, np.array(self.vertices))
@@ -287,16 +321,50 @@ def _fault_of_polygon(vertices: np.ndarray) -> str:
     back = (_cross(edges, following) == 0) & (np.sum(edges * following, axis=1) < 0)
     if np.any(back):
         return f"the outline runs back on itself at vertex {(int(np.argmax(back)) + 1) % n}"
-    for i in range(n - 2):
-        # Edges that share no vertex with edge i; the last edge is a neighbour of the first.
-        others = np.arange(i + 2, n if i else n - 1)
-        a, b, c, d = vertices[i], ahead[i], vertices[others], ahead[others]
-        side_c, side_d = _cross(b - a, c - a), _cross(b - a, d - a)
-        side_a, side_b = _cross(d - c, a - c), _cross(d - c, b - c)
-        # Collinear segments have four zero sides, so their bounding boxes must meet as well.
-        boxes = np.all((np.minimum(c, d) <= np.maximum(a, b)) & (np.maximum(c, d) >= np.minimum(a, b)), axis=1)
-        hit = boxes & (np.sign(side_c) * np.sign(side_d) <= 0) & (np.sign(side_a) * np.sign(side_b) <= 0)
-        if np.any(hit):
-            j = int(others[np.argmax(hit)])
-            return f"the edges after vertices {i} and {j} cross or touch: list the vertices in order round the outline"
-    return ""
+    crossing = _crossing(vertices, ahead)
+    if crossing is None:
+        return ""
+    i, j = crossing
+    return f"the edges after vertices {i} and {j} cross or touch: list the vertices in order round the outline"
+
+
+# Pairs of parts of an outline that are compared at once.
+_PAIRS = 100_000
+
+
+def _crossing(a: np.ndarray, b: np.ndarray) -> tuple[int, int] | None:
+    """Return two edges of an outline that meet although they share no vertex; edge i is from a[i] to b[i], (n, 2).
+
+    Two parts of 2^k edges each are halved if their bounding boxes meet. For an outline that does not come near itself
+    the effort is O(n log n).
+    """
+    n = len(a)
+    boxes = [(np.minimum(a, b), np.maximum(a, b))]
+    while len(boxes[-1][0]) > 1:
+        firsts = np.arange(0, len(boxes[-1][0]), 2)
+        low, high = boxes[-1]
+        boxes.append((np.minimum.reduceat(low, firsts), np.maximum.reduceat(high, firsts)))
+    waiting = [(len(boxes) - 1, np.zeros(1, np.int64), np.zeros(1, np.int64))]
+    while waiting:
+        level, i, j = waiting.pop()
+        if level == 0:
+            # The last edge is a neighbour of the first.
+            apart = (j - i > 1) & ((i > 0) | (j < n - 1))
+            i, j = i[apart], j[apart]
+            u, v = b[i] - a[i], b[j] - a[j]
+            # Collinear segments have four zero sides; the boxes of these meet.
+            sides = np.sign(_cross(u, a[j] - a[i])) * np.sign(_cross(u, b[j] - a[i]))
+            others = np.sign(_cross(v, a[i] - a[j])) * np.sign(_cross(v, b[i] - a[j]))
+            hit = np.flatnonzero((sides <= 0) & (others <= 0))
+            if len(hit):
+                return min(zip(i[hit].tolist(), j[hit].tolist(), strict=True))
+            continue
+        low, high = boxes[level - 1]
+        i, j = (np.concatenate([2 * i, 2 * i, 2 * i + 1, 2 * i + 1]), np.concatenate([2 * j, 2 * j + 1] * 2))
+        real = (i <= j) & (j < len(low))
+        i, j = i[real], j[real]
+        meet = np.all((low[i] <= high[j]) & (low[j] <= high[i]), axis=1)
+        i, j = i[meet], j[meet]
+        parts = len(i) // _PAIRS + 1
+        waiting += [(level - 1, *pair) for pair in zip(np.array_split(i, parts), np.array_split(j, parts), strict=True)]
+    return None

@@ -4,7 +4,7 @@ Means are differences of integrals in tables. The host fills the table of a run 
 (`scene.quadrature.Mean`); the kernel stops before a kick that would end beyond them. Constants are not part of kernels,
 so that runs share kernels.
 
-Each node of a tree is an object whose `evaluate` is inlined by its caller. Conditions are integers, 0 or 1, or for a
+A kernel has each node of a tree once, as a variable (`Evaluation`). Conditions are integers, 0 or 1, or for a
 condition on time the fraction of the kick for which it holds. Both branches of `a if c else b` are evaluated. KERNELS
 has the names of `scene.functions`; its functions agree with NumPy to rounding.
 """
@@ -12,7 +12,7 @@ has the names of `scene.functions`; its functions agree with NumPy to rounding.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial, reduce
+from functools import reduce
 
 import numpy as np
 from taichi.lang import ops
@@ -29,9 +29,19 @@ LARGEST_PRODUCT = 64
 
 @dataclass(frozen=True)
 class Place:
-    """A leaf of a tree for kernels: the index of a number of the run."""
+    """The index of a number of the run."""
 
     index: int
+
+
+@dataclass(frozen=True)
+class Formula:
+    """A tree for kernels, each node once: numbers of the run, coordinates, and functions of the steps at some indices.
+
+    An exponent that is whole is a part of its step: ("**", (index of the base,), exponent).
+    """
+
+    steps: tuple[Place | Name | tuple, ...]
 
 
 class Entries:
@@ -50,30 +60,45 @@ class Entries:
         self.found.append(float(value))
         return Place(len(self.found) - 1)
 
-    def placed(self, tree: Tree) -> "Tree | Place":
+    def placed(self, tree: Tree) -> Formula | Place:
         """Return a tree for `node_of`, with places for constants and for subtrees that depend only on time."""
+        steps: list[Place | Name | tuple] = []
+        self._add(tree, steps, {})
+        return steps[0] if isinstance(steps[0], Place) and len(steps) == 1 else Formula(tuple(steps))
+
+    def _add(self, tree: Tree, steps: list[Place | Name | tuple], known: dict[int, int]) -> int:
+        """Append the steps of a tree, unless they are known by its identity; return the index of the last."""
+
+        def put(step: Place | Name | tuple) -> int:
+            steps.append(step)
+            return len(steps) - 1
+
+        if id(tree) in known:
+            return known[id(tree)]
         names = names_in(tree)
         if names == {"t"}:
             if tree not in self.found:
                 self.found.append(tree)
-            return Place(self.found.index(tree))
-        if isinstance(tree, Number):
-            return self.number(tree.value)
-        if isinstance(tree, Name):
-            return self._coordinate(tree)
-        function, arguments = tree.function, tree.arguments
-        if whole_power(tree) is not None:
-            return Apply(function, (self.placed(arguments[0]), arguments[1]))
-        # A condition on time may hold for a part of the kick.
-        if function == "if" and "t" in names_in(arguments[0]):
-            function = "blend"
-        return Apply(function, tuple(self.placed(argument) for argument in arguments))
-
-    def _coordinate(self, name: Name) -> Tree:
-        if name.name in VELOCITY:
-            return name
-        names = INITIAL if name.name in INITIAL else POSITION
-        return Apply("+", (name, self.number(self._origin[names.index(name.name)])))
+            index = put(Place(self.found.index(tree)))
+        elif isinstance(tree, Number):
+            index = put(self.number(tree.value))
+        elif isinstance(tree, Name):
+            index = put(tree)
+            if tree.name not in VELOCITY:
+                axes = INITIAL if tree.name in INITIAL else POSITION
+                index = put(("+", (index, put(self.number(self._origin[axes.index(tree.name)])))))
+        elif (exponent := whole_power(tree)) is not None:
+            index = put(("**", (self._add(tree.arguments[0], steps, known),), exponent))
+        else:
+            inner = tuple(self._add(argument, steps, known) for argument in tree.arguments)
+            if tree.function in ("min", "max"):
+                index = reduce(lambda a, b: put((tree.function, (a, b))), inner)
+            else:
+                # A condition on time may hold for a part of the kick.
+                blends = tree.function == "if" and "t" in names_in(tree.arguments[0])
+                index = put(("blend" if blends else tree.function, inner))
+        known[id(tree)] = index
+        return index
 
 
 def whole_power(tree: Apply) -> int | None:
@@ -411,13 +436,12 @@ class Reading:
 class Power:
     """An integer power, by repeated squaring."""
 
-    def __init__(self, base: object, exponent: int) -> None:
-        self.base, self.inverse = base, exponent < 0
+    def __init__(self, exponent: int) -> None:
+        self.inverse = exponent < 0
         self.bits = tuple(bit == "1" for bit in bin(abs(exponent))[2:])
 
     @ti.func
-    def evaluate(self, x: ti.template(), X: ti.template(), run: int):
-        base = self.base.evaluate(x, X, run)
+    def of(self, base):
         result = ti.cast(1.0, float)
         for bit in ti.static(self.bits):
             result *= result
@@ -429,33 +453,44 @@ class Power:
 
 
 @ti.data_oriented
-class Application:
-    """A function applied to the values of other nodes."""
+class Evaluation:
+    """The steps of a formula: leaves, and functions with the indices of the steps that they are applied to."""
 
-    def __init__(self, function: Callable, *arguments: object) -> None:
-        self.function, self.arguments = function, arguments
+    def __init__(self, steps: Sequence[tuple[object, tuple[int, ...]]]) -> None:
+        self.steps = tuple(steps)
 
     @ti.func
     def evaluate(self, x: ti.template(), X: ti.template(), run: int):
-        return self.function(*[node.evaluate(x, X, run) for node in ti.static(self.arguments)])
+        found = ti.static([])
+        for step, arguments in ti.static(self.steps):
+            # A variable for each step, which later steps read.
+            if ti.static(len(arguments) == 0):
+                value = step.evaluate(x, X, run)
+                ti.static(found.append(value))
+            else:
+                value = step(*[found[k] for k in ti.static(arguments)])
+                ti.static(found.append(value))
+        return found[-1]
 
 
-def node_of(tree: "Tree | Place", values: DeviceValues) -> object:
-    """Return the node that evaluates a tree of `Entries` at x and X, (d,), m, with the numbers of a run.
+def node_of(formula: Formula | Place, values: DeviceValues) -> Reading | Evaluation:
+    """Return the node that evaluates a result of `Entries.placed` at x and X, (d,), m, with the numbers of a run.
 
-    For a tree of the velocity, X has it from entry MOVES on, m/s.
+    For a formula of the velocity, X has it from entry MOVES on, m/s.
     """
-    if isinstance(tree, Place):
-        return Reading(values, tree.index)
-    if isinstance(tree, Name):
-        if tree.name in VELOCITY:
-            return Coordinate(MOVES + VELOCITY.index(tree.name), initial=True)
-        names = INITIAL if tree.name in INITIAL else POSITION
-        return Coordinate(names.index(tree.name), initial=names is INITIAL)
-    exponent = whole_power(tree)
-    if exponent is not None:
-        return Power(node_of(tree.arguments[0], values), exponent)
-    function, nodes = KERNELS[tree.function], [node_of(argument, values) for argument in tree.arguments]
-    if tree.function in ("min", "max"):
-        return reduce(partial(Application, function), nodes)
-    return Application(function, *nodes)
+    if isinstance(formula, Place):
+        return Reading(values, formula.index)
+    steps: list[tuple[object, tuple[int, ...]]] = []
+    for step in formula.steps:
+        match step:
+            case Place():
+                steps.append((Reading(values, step.index), ()))
+            case Name():
+                axes = next(axes for axes in (VELOCITY, INITIAL, POSITION) if step.name in axes)
+                axis = axes.index(step.name) + (MOVES if axes is VELOCITY else 0)
+                steps.append((Coordinate(axis, initial=axes is not POSITION), ()))
+            case (_, arguments, exponent):
+                steps.append((Power(exponent).of, arguments))
+            case (function, arguments):
+                steps.append((KERNELS[function], arguments))
+    return Evaluation(steps)

@@ -18,7 +18,7 @@ from mpmcli.scene.entry import tree_of
 from mpmcli.scene.expression import INITIAL, POSITION, VELOCITY, Number, Tree, apply, derivative, names_in
 from mpmcli.scene.quadrature import largest_of
 from mpmcli.scene.schema import Force
-from mpmcli.solver.drive.expressions import MOVES, DeviceValues, Entries, Place, RunValues, TimeTables, node_of
+from mpmcli.solver.drive.expressions import MOVES, DeviceValues, Entries, Formula, Place, RunValues, TimeTables, node_of
 from mpmcli.solver.machine.backend import Backend
 from mpmcli.solver.particles.arrays import ParticleArrays
 from mpmcli.solver.particles.state_bounds import build_maxima
@@ -63,7 +63,7 @@ class Term:
     """
 
     place: int
-    axes: tuple[tuple[int, Tree | Place, Tree | Place | None], ...]
+    axes: tuple[tuple[int, Formula | Place, Formula | Place | None], ...]
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class ForceTerms:
     drags: bool = False
     reach: Place | None = None
     slope: Place | None = None
-    gravity: tuple[Tree | Place, ...] = ()
+    gravity: tuple[Formula | Place, ...] = ()
 
     @staticmethod
     def of(scene: Scene, names: Sequence[str], entries: Entries) -> "ForceTerms":
@@ -114,7 +114,7 @@ class ForceTerms:
         )
 
 
-def _decrease(tree: Tree, axis: int, entries: Entries) -> Tree | Place | None:
+def _decrease(tree: Tree, axis: int, entries: Entries) -> Formula | Place | None:
     """Return the placed tree of -da/dv along an axis, 1/s, or None if the tree does not depend on v there."""
     if VELOCITY[axis] not in names_in(tree):
         return None

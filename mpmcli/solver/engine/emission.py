@@ -11,12 +11,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from mpmcli.boundaries.doubles import as_double
+from mpmcli.frames.frame import ACTIVE, BLOCKED, WAITING
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene, highest_speed
 from mpmcli.solver.engine.device import Device
 from mpmcli.solver.engine.run_state import Layout, RunState
 from mpmcli.solver.particles.inflow import RETRY, first_ids
-from mpmcli.solver.particles.sort import ACTIVE, BLOCKED, WAITING
 
 
 @ti.data_oriented

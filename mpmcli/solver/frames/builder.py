@@ -7,11 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mpmcli.frames.frame import STATUS, Frame
+from mpmcli.frames.frame import ACTIVE, BLOCKED, RETIRED, STATUS, WAITING, Frame
 from mpmcli.frames.ledger import LOADS, RIGID, LedgerRow
 from mpmcli.scene import BodyParticles, Scene
 from mpmcli.solver.frames.columns import FrameArrays, FrameColumns, ParticleConstants, RunConstants, parts_of
-from mpmcli.solver.particles.sort import ACTIVE, BLOCKED, RETIRED, WAITING
 from mpmcli.stability.transfer_factors import affine_moment
 
 # Particles per batch of sums, which bounds the memory.

@@ -282,6 +282,8 @@ def _initialise(backend: Backend) -> None:
             # Real functions may write values that a serial loop would cache in variables; steps are equally fast
             # without.
             cache_loop_invariant_global_vars=not backend.on_cpu,
+            # Formulas are loops that are unrolled, a step for each operator.
+            unrolling_limit=0,
             log_level=ti.ERROR,
             **OPTIMISATION[backend.optimisation],
         )

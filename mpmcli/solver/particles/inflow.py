@@ -13,10 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from mpmcli.boundaries.rows import Rows
+from mpmcli.frames.frame import ACTIVE, BLOCKED, WAITING
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
 from mpmcli.scene.sheets import Sheets, sheets_of
-from mpmcli.solver.particles.sort import ACTIVE, BLOCKED, WAITING, entry_count
+from mpmcli.solver.particles.sort import entry_count
 
 # Delay before a layer of which half or more is blocked tries again, as a fraction of the time in which a layer enters.
 RETRY = 0.25

@@ -8,12 +8,11 @@ number of threads (docs/theory.md, 8).
 
 from collections.abc import Sequence
 
+from mpmcli.frames.frame import ACTIVE, RETIRED
 from mpmcli.quick_taichi import ti
 from mpmcli.solver.grid.grid import Grid
 from mpmcli.solver.particles.arrays import ParticleArrays
 
-# Status of a particle: waiting for its emitter, active, retired beyond an open face, or permanently blocked.
-WAITING, ACTIVE, RETIRED, BLOCKED = range(4)
 # Taichi gives a CPU thread at least this many iterations of a parallel loop.
 CHUNK = 512
 # Tiles per entry of the two-level prefix sum.
