@@ -127,19 +127,21 @@ BEGIN, END = MARKS
         (b"Above.\n", BEGIN + b"\nold\n" + END + b"\n", b"Below.\n"),
         (BEGIN + b"\nno end\n\n", b"", b""),
         (BEGIN + b"\nno end\n", BEGIN + b"\nold\n" + END + b"\n", b"Below.\n"),
+        (b"---\nlicense: mit\n---\nAbove.\n", BEGIN + b"\nold\n" + END + b"\n", b"Below.\n"),
     ],
-    ids=["no marks", "marks", "no end mark", "a mark too many"],
+    ids=["no marks", "marks", "no end mark", "a mark too many", "front matter"],
 )
 def test_the_text_of_its_owner_is_kept(above, old, below):
-    """Byte for byte, around the card; written twice, the file is the same."""
+    """Byte for byte, around the card; written twice, the file is the same. Front matter of the owner replaces ours."""
     dataset = make_dataset("whole")
     readme = dataset / "README.md"
-    card = readme.read_bytes()
-    assert card.startswith(BEGIN) and card.endswith(END + b"\n")
+    front, card = readme.read_bytes().split(BEGIN)
+    front, card = b"" if above.startswith(b"---") else front, BEGIN + card
+    assert card.endswith(END + b"\n")
     # A card that is not there yet comes after an empty line.
     readme.write_bytes(above + old + below if old else above[:-1])
     for _ in range(2):
-        assert write_card(dataset).read_bytes() == above + card + below
+        assert write_card(dataset).read_bytes() == front + above + card + below
 
 
 def test_a_dataset_without_trajectories_has_a_card(monkeypatch):

@@ -12,7 +12,7 @@ import pytest
 from mpmcli.errors import InputError
 from mpmcli.output import RunRecord
 from mpmcli.output.directory import take_directory
-from mpmcli.output.lock import LOCK, Owner, lock_is_held, process_start, take_lock
+from mpmcli.output.lock import LOCK, NO_LOCKS, Owner, lock_is_held, process_start, take_lock
 from mpmcli.output.run_record import DIED, ELSEWHERE, read_record, run_status
 
 HOLD = """
@@ -80,6 +80,23 @@ def test_a_symbolic_link_is_not_followed(tmp_path: Path) -> None:
     RunRecord(place).write()
     assert target.read_text(encoding="utf-8") == "mine" and (place / LOCK).is_symlink()
     assert sorted(path.name for path in place.iterdir()) == ["run.json", LOCK]
+
+
+@pytest.mark.parametrize("code", NO_LOCKS)
+def test_a_file_system_without_locks_is_no_obstacle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int) -> None:
+    """As NFS and Lustre answer where they are mounted without: the process in the file counts, if it lives."""
+
+    def no_lock(*_: object) -> None:
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr("mpmcli.output.lock.fcntl.flock", no_lock)
+    with hold(tmp_path) as process:
+        with pytest.raises(InputError, match=rf"being written by process {process.pid} on"):
+            take_lock(tmp_path)
+        process.stdin.close()
+        process.wait()
+    take_lock(tmp_path).close()
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_of_many_that_take_it_at_once_one_has_it_at_any_time(tmp_path: Path) -> None:

@@ -167,9 +167,9 @@ def require_empty(directory: Path, *, locked: bool = False) -> None:
     check_directory(directory, overwrite=False, locked=locked)
 
 
-def require_same_program(place: Path, found: Iterable[Mapping[str, Any]], now: Mapping[str, str]) -> None:
-    """Refuse trajectories of another version of mpmcli or Taichi or backend than `now`, by column; "auto" is any."""
-    for before in found:
+def require_same_program(place: Path, facts: Mapping[str, Any], rows: Iterable[Row], now: Mapping[str, str]) -> None:
+    """Refuse a dataset of another version of mpmcli or Taichi or backend than `now`, by column; "auto" is any."""
+    for before in (facts, *(vars(row) for row in rows if row.verdict != "failed")):
         for name, value in now.items():
             if value not in ("auto", before.get(name, value)):
                 raise InputError(

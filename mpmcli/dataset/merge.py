@@ -30,8 +30,7 @@ def merge(parts: Sequence[Path], target: Path) -> Status:
     rows = [row for part in parts for row in Manifest(part).rows()]
     first = next((vars(row) for row in rows if row.verdict != "failed"), facts[0])
     for part, its in zip(parts, facts, strict=True):
-        done = [vars(row) for row in Manifest(part).rows() if row.verdict != "failed"]
-        require_same_program(part, [its, *done], {name: first[name] for name in PROGRAM if name in first})
+        require_same_program(part, its, Manifest(part).rows(), {name: first[name] for name in PROGRAM if name in first})
         if {**its, "part": None} != {**facts[0], "part": None}:
             raise InputError(f"{part} has another sweep, other files or another version of mpmcli than {parts[0]}.")
     count = facts[0]["part"][1]

@@ -171,8 +171,7 @@ def open_folder(
                 f"{changed[0]} has changed since {directory} was begun, which cannot be resumed with it: put it back "
                 "as it was, or give another directory with -o."
             )
-        rows = [vars(row) for row in manifest.rows() if row.verdict != "failed"]
-        require_same_program(directory, [facts, *rows], {**program(), "arch": settings.arch})
+        require_same_program(directory, facts, manifest.rows(), {**program(), "arch": settings.arch})
         return Folder(directory, sweep.count, facts["per_shard"], settings.part), manifest
     replaces = settings.overwrite and directory.is_dir() and any(path.name != LOCK for path in directory.iterdir())
     if replaces and not (directory / MANIFEST).exists():

@@ -47,7 +47,17 @@ class TakenDirectory:
 
     def clear(self, first: Path | None = None) -> None:
         """Remove an earlier result, but not the `first` file of a new one; InputError: it cannot be removed."""
-        _remove_result(self.path, {*self.spared, first and first.resolve()})
+        spared = {*self.spared, first and first.resolve()}
+        ours = [path for path in _result_files(self.path) if path.resolve() not in spared]
+        try:
+            remove_segments(self.path, spared)
+            remove_numbered(self.path / CHECKPOINTS, CHECKPOINT_NAME)
+            # The record is removed last: while it exists, the remaining files are known to be mpmcli's.
+            for path in sorted(ours, key=lambda path: path.name == RECORD):
+                path.unlink(missing_ok=True)
+        except OSError as error:
+            reason = error.strerror or error
+            raise InputError(f"The earlier result in {self.path} cannot be removed ({reason}).") from error
         self.replaces = False
 
     def undo(self) -> None:
@@ -161,18 +171,6 @@ def _result_files(directory: Path) -> list[Path]:
         # With `-o .` it may be the scene that is about to run.
         raise InputError(f"{directory / SCENE} was not written by mpmcli: give another directory with -o.")
     return ours
-
-
-def _remove_result(directory: Path, spared: Collection[Path | None]) -> None:
-    ours = [path for path in _result_files(directory) if path.resolve() not in spared]
-    try:
-        remove_segments(directory, spared)
-        remove_numbered(directory / CHECKPOINTS, CHECKPOINT_NAME)
-        # The record is removed last: while it exists, the remaining files are known to be mpmcli's.
-        for path in sorted(ours, key=lambda path: path.name == RECORD):
-            path.unlink(missing_ok=True)
-    except OSError as error:
-        raise InputError(f"The earlier result in {directory} cannot be removed ({error.strerror or error}).") from error
 
 
 def has_frames(directory: Path) -> bool:
