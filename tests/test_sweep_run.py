@@ -516,6 +516,7 @@ def test_overwrite_removes_files_of_mpmcli_alone(monkeypatch: pytest.MonkeyPatch
         there = Path(directory)
         found = files_of(there)
         made = {"sweep.toml", "base.toml", "manifest.sqlite", "README.md", "quarantine/000004.h5"}
+        made |= {"train.jsonl", "valid.jsonl"}
         assert set(found) == {*mine, *made, "shards/00000.h5", "shards/00001.h5"}
         assert all(found[name].decode() == SWEEP.replace("1000", "6") for name in mine)
         assert found["README.md"].startswith(b"# Ours\r\n<!--") and found["README.md"].endswith(b"Cite us.\r\n")
