@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 from command import run_here
 from drawn_results import WATER, frame, header, lattice, row, write
+from scipy.spatial.transform import Rotation
 
 from mpmcli.dataset import subsample
 from mpmcli.dataset.subsample import SubsampledTrajectory, joined_row
+from mpmcli.scene.colliders import Collider
 
 H = 0.05
 POST = {"name": "post", "shape": {"ball": {"center": [0.7, 0.5], "radius": 0.1}}}
@@ -115,6 +117,22 @@ def test_walls_that_cannot_be_had_are_refused(tmp_path: Path) -> None:
     outcome = run_here("export", path, "--to", "vtkhdf", "-o", tmp_path / "out", "--walls", "colliders")
     assert outcome.status == 2 and "--walls is for training code and NumPy" in outcome.stderr
     assert not (tmp_path / "out").exists()
+
+
+def test_an_npz_has_the_poses_of_moving_colliders(tmp_path: Path) -> None:
+    """The rod turns by 0.5 rad a frame about its centre; the post rests. A quaternion turns as the motion does."""
+    export(run(tmp_path / "run", [POST, ROD]), "npz", tmp_path / "out")
+    with np.load(tmp_path / "out" / "000000.npz") as file:
+        assert file["collider_number"].tolist() == [1]
+        expected = [[[0.3, 0.625, 0.5 * k]] for k in range(4)]
+        assert file["collider_pose"] == pytest.approx(np.array(expected), abs=1e-9)
+    blade = {"name": "b", "shape": {"ball": {"center": [0.5, 0.4, 0.3], "radius": 0.1}}, "axis": [1.0, 2.0, 2.0]}
+    blade |= {"angular_velocity": 3.0, "velocity": [0.1, 0.0, -0.2]}
+    motion = Collider.model_validate(blade, context={"dimension": 3}).motion
+    points = np.random.default_rng(0).uniform(0.0, 1.0, (5, 3))
+    for time, (*place, w, x, y, z) in zip((0.0, 0.4), motion.poses([0.0, 0.4]), strict=True):
+        turned = Rotation.from_quat([x, y, z, w]).apply(points - [0.5, 0.4, 0.3])
+        assert turned + place == pytest.approx(motion.placed(points, time), abs=1e-12)
 
 
 def test_forces_of_joined_frames_are_means_over_their_time(tmp_path: Path) -> None:

@@ -172,6 +172,10 @@ def test_saved_surfaces_are_read_by_others(dimension: int, tmp_path: Path) -> No
         size = data.volume if dimension == 3 else data.area
         assert size == pytest.approx((12 * DISTANCE) ** dimension, rel=0.06), path.name
         assert data.bounds[0] == pytest.approx(corner, abs=0.3 * DISTANCE)
+    if dimension == 3:
+        # An OBJ has y up, the z of the scene, and x to the right: turned by 90 degrees about x, without a mirror.
+        upright, turned = (np.asarray(pv.read(path).points) for path in written[2:4])
+        assert np.allclose(turned, np.stack([upright[:, 0], upright[:, 2], -upright[:, 1]], axis=1), atol=1e-6)
     assert pv.read(written[0]).field_data["TimeValue"][0] == 0.25
     index = write_series(scene, tmp_path / "meshes", [(13, 0.5), (12, 0.25)])[0]
     assert index.read_text().index("000012") < index.read_text().index("000013")

@@ -67,6 +67,22 @@ def test_the_inside_of_a_ball(tmp_path: Path) -> None:
         assert form.contains(points)[away < R - depth].all() and not form.contains(points)[away > R].any()
 
 
+def test_the_place_of_a_hole_is_told(tmp_path: Path) -> None:
+    """A ball without seven triangles apart and a patch of the 6 triangles round a vertex, whose rim has 6 edges."""
+    import trimesh
+
+    whole = trimesh.creation.icosphere(subdivisions=3, radius=R)
+    vertex = int(np.flatnonzero(np.bincount(whole.faces.ravel()) == 6)[50])
+    patch = (whole.faces == vertex).any(axis=1)
+    far = np.flatnonzero(whole.triangles_center @ whole.vertices[vertex] < 0)[::80][:7]
+    patch[far] = True
+    trimesh.Trimesh(whole.vertices, whole.faces[~patch]).export(tmp_path / "open.ply")
+    with pytest.raises(GeometryFileError, match=rf"round {len(far) + 1} holes, the largest of 6 edges at \[") as caught:
+        read_mesh(tmp_path / "open.ply")
+    told = np.array([float(one) for one in str(caught.value).split("at [")[1].split("]")[0].split(",")])
+    assert np.linalg.norm(told - whole.vertices[vertex]) < 0.05 * R
+
+
 def test_an_off_file_may_begin_with_a_comment(tmp_path: Path) -> None:
     """A unit cube of quads, as geometry programs write it."""
     quads = "4 0 3 2 1\n4 4 5 6 7\n4 0 1 5 4\n4 1 2 6 5\n4 2 3 7 6\n4 3 0 4 7\n"

@@ -27,6 +27,7 @@ from mpmcli.frames.ledger import RIGID
 from mpmcli.output.durable import ask_for
 from mpmcli.output.layout import POSITION
 from mpmcli.output.vtkhdf import VtkhdfWriter, file_size
+from mpmcli.scene.colliders import Motion
 from mpmcli.scene.problem import listed
 
 # Entries of a format in metadata.json, and notes for the user.
@@ -356,6 +357,11 @@ class Npz(Format):
             dtype = trajectory.layout.arrays["Points"].dtype
             yield "wall_position", trajectory.walls.positions(trajectory.times).astype(dtype)
             yield "wall_collider", trajectory.walls.numbers
+        driven = [one for one in trajectory.source.colliders if isinstance(one.motion, Motion) and one.motion.moves]
+        if driven:
+            names = trajectory.source.header.collider_names
+            yield "collider_pose", np.stack([one.motion.poses(trajectory.times) for one in driven], axis=1)
+            yield "collider_number", np.array([names.index(one.name) for one in driven], np.int32)
         if rows[0].rigid_pose:
             for name in RIGID:
                 yield name, np.array([getattr(row, name) for row in rows])

@@ -321,15 +321,19 @@ def _write_vtp(path: Path, mesh: Mesh, time: float) -> None:
 
 
 def _write_obj(path: Path, mesh: Mesh, time: float) -> None:
+    # Programs read OBJ with y up, and the up of a scene in 3D is z; a flat mesh lies in the plane x, y already.
+    flat = not mesh.points[:, 2].any()
+    points, normals = (v if flat else v[:, [0, 2, 1]] * [1, 1, -1] for v in (mesh.points, mesh.normals))
+
     def lines(form: str, values: np.ndarray) -> str:
         return (form * len(values)) % tuple(values.ravel().tolist())
 
     corners = np.repeat(mesh.triangles + 1, 2, axis=1)
     write_text(
         path,
-        f"# time {time:.9g} s, lengths in metres\n"
-        + lines("v %.9g %.9g %.9g\n", mesh.points)
-        + lines("vn %.6g %.6g %.6g\n", mesh.normals)
+        f"# time {time:.9g} s, lengths in metres, y up{'' if flat else ': x, z, -y of the scene'}\n"
+        + lines("v %.9g %.9g %.9g\n", points)
+        + lines("vn %.6g %.6g %.6g\n", normals)
         + lines("f %d//%d %d//%d %d//%d\n", corners),
         unique=True,
     )

@@ -65,6 +65,14 @@ class Motion(Posed):
         d = len(self.pivot)
         return np.array(self.pivot) + offset, rotation(self.axis, angle)[:d, :d]
 
+    def poses(self, times: Sequence[float]) -> np.ndarray:
+        """Return place of the pivot, m, and angle, rad, or unit quaternion, real part first, (T, 3) or (T, 7)."""
+        found = [(np.array(self.pivot) + offset, angle) for offset, angle in map(self.at, times)]
+        if len(self.pivot) == 2:
+            return np.array([[*place, angle] for place, angle in found])
+        turns = [(math.cos(angle / 2), *(math.sin(angle / 2) * np.array(self.axis))) for _, angle in found]
+        return np.array([[*place, *turn] for (place, _), turn in zip(found, turns, strict=True)])
+
     def fastest(self, reach: float, end: float) -> float:
         """Return a bound on the speed of points within `reach` (m) of the pivot between 0 and `end` (s), m/s."""
         speeds = [largest_of(tree, 0.0, end) for tree in self.rates]

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from pydantic import Field, PrivateAttr, ValidationInfo, model_validator
 
+from mpmcli.plain_text import counted
 from mpmcli.scene.points import GeometryFileError, distinct_rows, file_version, read_geometry, scene_file
 from mpmcli.scene.primitives import Solid, grid_points, rotation
 from mpmcli.scene.quantity import Axis, Number, Positive, Table, Vector, flaw, place_text
@@ -231,8 +232,11 @@ def _closed(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np
     directed = np.concatenate([triangles[:, [k, (k + 1) % 3]] for k in range(3)])
     edges, which = distinct_rows(np.sort(directed, axis=1))
     uses = np.bincount(which, minlength=len(edges))
-    if odd := int(np.sum(uses % 2)):
-        raise GeometryFileError(f"its surface is open: {odd} of {len(edges)} edges have a triangle on one side only")
+    if len(odd := np.sort(directed, axis=1)[edges[uses % 2 == 1]]):
+        raise GeometryFileError(
+            f"its surface is open: {len(odd)} of {len(edges)} edges have a triangle on one side only, "
+            f"{_holes(vertices, odd)}"
+        )
     ways = np.bincount(which, weights=np.where(directed[:, 0] < directed[:, 1], 1, -1), minlength=len(edges))
     if turned := int(np.sum(ways != 0)):
         raise GeometryFileError(
@@ -253,6 +257,24 @@ def _closed(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np
             where = place_text(points[np.argmax(wrong)])
             raise GeometryFileError(f"{said}, for example at {where} in its own units")
     return vertices, triangles
+
+
+def _holes(vertices: np.ndarray, edges: np.ndarray) -> str:
+    """Return where some edges (n, 2) that lack a triangle lie, and the remedy."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    n = len(vertices)
+    joined = coo_array((np.ones(len(edges)), edges.T), shape=(n, n))
+    hole = connected_components(joined, directed=False)[1][edges[:, 0]]
+    sizes = np.bincount(hole)
+    largest = int(np.argmax(sizes))
+    where = place_text(vertices[np.unique(edges[hole == largest])].mean(axis=0))
+    count = int(np.count_nonzero(sizes))
+    return (
+        f"round {counted(count, 'hole')}, the largest of {sizes[largest]} edges at {where} in its own units; fill "
+        "holes and merge points that nearly coincide, as MeshLab and Blender do"
+    )
 
 
 MILLIMETRE = 1e-3
