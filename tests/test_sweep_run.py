@@ -519,7 +519,8 @@ def test_overwrite_removes_files_of_mpmcli_alone(monkeypatch: pytest.MonkeyPatch
         made |= {"train.jsonl", "valid.jsonl"}
         assert set(found) == {*mine, *made, "shards/00000.h5", "shards/00001.h5"}
         assert all(found[name].decode() == SWEEP.replace("1000", "6") for name in mine)
-        assert found["README.md"].startswith(b"# Ours\r\n<!--") and found["README.md"].endswith(b"Cite us.\r\n")
+        _, front, text = found["README.md"].split(b"---\n", 2)
+        assert b"split: train" in front and text.startswith(b"\n# Ours\r\n<!--") and text.endswith(b"Cite us.\r\n")
         assert verify(there).faults == () and len(open_dataset(there)) == 5
 
 

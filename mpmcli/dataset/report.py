@@ -215,7 +215,7 @@ MARKS = b"<!-- card: written by mpmcli -->", b"<!-- end of card -->"
 _MARKED = re.compile(rb"(?s)%b((?!%b).)*?%b\n?" % (MARKS[0], MARKS[0], MARKS[1]))
 # First lines of the front matter; one with other lines is the owner's.
 FRONT = "---", "configs:", "- config_name: default", "  data_files:"
-_FRONT = re.compile(("\\A" + "\n".join(FRONT) + r"\n(?:  - split: \w+\n    path: \S+\n)+---\n+").encode())
+_FRONT = re.compile(("\n".join(FRONT) + r"\n(?:  - split: \w+\n    path: \S+\n)+---\n+").encode())
 # Bins of a histogram; if there are few distinct values, each is counted separately.
 BINS = 10
 MOST_COUNTED = 6
