@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -32,7 +32,7 @@ from mpmcli.dataset.merge import merge
 from mpmcli.dataset.report import status_of, verify
 from mpmcli.dataset.sweep import Sweep
 from mpmcli.dataset.sweep_file import load_sweep
-from mpmcli.dataset.sweep_run import SweepSettings, SweepState, _tasks, discard_beginning, run_sweep, taken_folder
+from mpmcli.dataset.sweep_run import LOST, SweepSettings, SweepState, _tasks, discard_beginning, run_sweep, taken_folder
 from mpmcli.errors import InputError
 from mpmcli.materials.registry import parameter_models
 from mpmcli.output import open_result
@@ -288,20 +288,30 @@ def test_an_interrupt_keeps_what_is_done(tmp_path: Path, monkeypatch: pytest.Mon
     assert verify(tmp_path / "dataset").faults == ()
 
 
-LATE = """
-import logging
-from mpmcli.dataset.compute import local_workers
-with local_workers(1):
-    pass
-for name, level in (("distributed.batched", logging.INFO), ("distributed.client", logging.ERROR)):
-    logging.getLogger(name).log(level, "The connection has closed.")
-"""
+def test_local_workers_open_no_port(tmp_path: Path) -> None:
+    """Nobody else can send them code: while a sweep runs, none of its processes listens, and none is connected."""
+    path = write_sweep(tmp_path, 40, BASE.replace("end = 0.05", "end = 0.5"))
+    manifest = tmp_path / "dataset" / "manifest.sqlite"
+    with started(tmp_path, "sweep", path, "-o", "dataset", "--workers", 2, "-q", own_group=True) as process:
+        _wait(lambda: manifest.exists() and status_of(tmp_path / "dataset").rows, 120)
+        workers = psutil.Process(process.pid).children(recursive=True)
+        assert len(workers) >= 2
+        for one in (psutil.Process(process.pid), *workers):
+            assert one.net_connections("inet") == []
+        os.killpg(process.pid, signal.SIGINT)
+        process.communicate(timeout=60)
 
 
-def test_dask_says_nothing_after_its_cluster_has_ended(run_python: Callable) -> None:
-    """As it does of a connection that closes late, with a traceback."""
-    done = run_python(LATE)
-    assert (done.stdout, done.stderr) == ("", "")
+def test_a_trajectory_that_kills_its_workers_is_left_out(tmp_path: Path) -> None:
+    """A law that ends each process but the first: three workers are lost, and the sweep goes on to its end."""
+    law = tmp_path / "fatal.py"
+    fatal = "import multiprocessing, os\n\nif multiprocessing.parent_process():\n    os._exit(7)\n"
+    law.write_text(fatal + LAW, encoding="utf-8")
+    path = write_sweep(tmp_path, 1)
+    outcome = run_here("sweep", path, "-o", tmp_path / "dataset", "--workers", 1, "--plugin", law, "-q")
+    assert (outcome.status, outcome.stderr) == (1, "")
+    (row,) = status_of(tmp_path / "dataset").rows
+    assert (row.verdict, row.reason) == ("failed", LOST)
 
 
 def test_ctrl_c_reaches_all_processes_and_shows_no_traceback(tmp_path: Path) -> None:

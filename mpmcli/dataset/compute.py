@@ -1,21 +1,22 @@
-"""Workers of a sweep, which draw, run and store trajectories, and the Dask cluster that sends them tasks."""
+"""Workers of a sweep, which draw, run and store trajectories: processes of this machine, or those of a Dask cluster."""
 
 import hashlib
 import json
 import logging
-import os
 import queue
 import signal
 import socket
 import threading
 import time
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cache, partial
+from multiprocessing import connection
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 
@@ -27,27 +28,25 @@ from mpmcli.dataset.sweep import Sweep
 from mpmcli.errors import InputError, RunError
 from mpmcli.materials.registry import load_plugins
 from mpmcli.output.checksums import path_digest
-from mpmcli.processes.pool import interrupts_blocked
+from mpmcli.processes.pool import SPAWN, follow_parent, interrupts_blocked, sharing_cores, silence
 from mpmcli.scene import LoadedScene, Scene, scene_to_toml
 from mpmcli.simulation.engine import Arch
 from mpmcli.simulation.runner import Recording, Runner
-
-if TYPE_CHECKING:
-    from distributed import LocalCluster
 
 # Number of retries of a trajectory, each with half the step of the previous run.
 RETRIES = 2
 # Trajectories that a worker draws before its first run, to determine the particle capacity.
 LOOK_AHEAD = 32
-# Tasks in flight per worker: one being computed and one waiting.
+# Tasks in flight per worker of a cluster: one being computed and one waiting.
 AHEAD = 2
-# Attempts to start a cluster.
-STARTS = 3
+# Workers that a trajectory may lose before it counts as failed.
+ATTEMPTS = 3
+# Time in which a worker may end and store its kernels, s.
+GRACE = 10.0
 # Seconds between calls of `stop`.
 PATIENCE = 0.2
 _SETTINGS = {
-    # Workers that a task may lose before it counts as failed.
-    "distributed.scheduler.allowed-failures": 5,
+    "distributed.scheduler.allowed-failures": ATTEMPTS - 1,
     # A step of a large scene blocks the interpreter for longer than Dask expects.
     "distributed.admin.tick.limit": "1h",
     "distributed.comm.timeouts.connect": "30s",
@@ -225,15 +224,128 @@ def trajectory_data(drawn: Draw, run: Recording) -> TrajectoryData:
     )
 
 
-class Workers:
-    """Workers that compute tasks, from `local_workers` or `joined_workers`."""
+class Workers(Protocol):
+    """Workers that compute tasks, from `local_workers` or `joined_workers`; `count` of them."""
+
+    count: int
+
+    def outcomes(self, tasks: Iterable[Task], stop: Callable[[], bool]) -> Iterator[tuple[Task, list[Row] | None]]:
+        """Yield each task with its rows as it ends, None if no worker survived; RunError: write or cluster failed."""
+        ...
+
+
+class LocalWorkers:
+    """Processes of this machine that compute one task after another, over pipes that no other process can open."""
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+        self._processes: dict[connection.Connection, SPAWN.Process] = {}
+        for _ in range(count):
+            self._start()
+
+    def _start(self) -> connection.Connection:
+        ours, theirs = SPAWN.Pipe()
+        process = SPAWN.Process(target=_serve, args=(theirs,), daemon=True)
+        try:
+            with interrupts_blocked(), sharing_cores(self.count):
+                process.start()
+        except OSError as error:
+            raise RunError(f"the workers do not start ({error}); --resume goes on with what is done.") from error
+        theirs.close()
+        self._processes[ours] = process
+        return ours
+
+    def outcomes(self, tasks: Iterable[Task], stop: Callable[[], bool]) -> Iterator[tuple[Task, list[Row] | None]]:
+        """Implement `Workers.outcomes`; a task whose worker is killed is tried again, its trajectories one by one."""
+        waiting, lost = deque(tasks), Counter[tuple[int, ...]]()
+        idle, under_way = list(self._processes), {}
+
+        def hand_out() -> None:
+            while waiting and idle:
+                pipe, task = idle.pop(), waiting.popleft()
+                under_way[pipe] = task
+                # A worker that was killed is found when it is read from.
+                with suppress(OSError):
+                    pipe.send(task)
+
+        hand_out()
+        while under_way:
+            ready = connection.wait(under_way, PATIENCE)
+            if stop():
+                raise KeyboardInterrupt
+            found = []
+            for pipe in ready:
+                task = under_way.pop(pipe)
+                try:
+                    answer = pipe.recv()
+                except (EOFError, OSError):
+                    self._processes.pop(pipe).join()
+                    pipe.close()
+                    pipe = self._start()
+                    lost[task.numbers] += 1
+                    answer = None
+                    if len(task.numbers) > 1:
+                        waiting.extendleft(replace(task, numbers=(number,)) for number in reversed(task.numbers))
+                    elif lost[task.numbers] < ATTEMPTS:
+                        waiting.appendleft(task)
+                    else:
+                        found.append((task, None))
+                idle.append(pipe)
+                if isinstance(answer, Exception):
+                    raise answer
+                if answer is not None:
+                    found.append((task, answer))
+            # The workers go on while the caller stores what was found.
+            hand_out()
+            yield from found
+
+    def end(self, wait: float) -> None:
+        """End the workers: each may end its task and store its kernels for `wait` s. Files are whole or absent."""
+        for pipe in self._processes:
+            pipe.close()
+        for process in self._processes.values():
+            process.join(wait)
+            process.kill()
+
+
+def _serve(pipe: connection.Connection) -> None:
+    """Compute the tasks of a pipe until its other end is closed."""
+    silence()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=follow_parent, daemon=True).start()
+    while True:
+        try:
+            task = pipe.recv()
+        except EOFError:
+            break
+        try:
+            answer: object = _compute(task)
+        except Exception as error:
+            answer = error
+        pipe.send(answer)
+
+
+@contextmanager
+def local_workers(count: int) -> Iterator[LocalWorkers]:
+    """Start workers on this machine, one process each; they end with the block."""
+    workers = LocalWorkers(count)
+    left = 0.0
+    try:
+        yield workers
+        left = GRACE
+    finally:
+        workers.end(left)
+
+
+class ClusterWorkers:
+    """Workers of a Dask cluster."""
 
     def __init__(self, client: object) -> None:
         self._client = client
         self.count = len(client.scheduler_info(n_workers=-1)["workers"])
 
     def outcomes(self, tasks: Iterable[Task], stop: Callable[[], bool]) -> Iterator[tuple[Task, list[Row] | None]]:
-        """Yield each task with its rows as it ends, None if no worker survived; RunError: write or cluster failed."""
+        """Implement `Workers.outcomes`."""
         from distributed import Future
         from distributed.scheduler import KilledWorker
 
@@ -275,23 +387,6 @@ class Workers:
 
 
 @contextmanager
-def local_workers(count: int) -> Iterator[Workers]:
-    """Start workers on this machine, one process each; they end with the block."""
-    from distributed import Client
-
-    with _quiet_dask(), _local_cluster(count) as cluster, Client(cluster) as client:
-        try:
-            yield Workers(client)
-        except BaseException:
-            # A worker receives no messages while a kernel runs; its files are whole or absent.
-            for nanny in cluster.workers.values():
-                nanny.auto_restart = False
-                with suppress(OSError, AttributeError, TypeError):
-                    os.kill(nanny.pid, signal.SIGKILL)
-            raise
-
-
-@contextmanager
 def _quiet_dask() -> Iterator[None]:
     """Silence Dask, which logs a traceback for a closed connection even after the cluster has ended."""
     import dask
@@ -303,32 +398,16 @@ def _quiet_dask() -> Iterator[None]:
         yield
 
 
-def _local_cluster(count: int) -> "LocalCluster":
-    """Start a cluster; retry if a worker was killed during its start, from which Dask does not recover."""
-    from distributed import LocalCluster
-
-    for left in reversed(range(STARTS)):
-        try:
-            with interrupts_blocked():
-                return LocalCluster(
-                    n_workers=count,
-                    threads_per_worker=1,
-                    processes=True,
-                    memory_limit=None,
-                    # Dask's status pages: for this machine only, on a free port.
-                    dashboard_address="127.0.0.1:0",
-                    silence_logs="CRITICAL",
-                )
-        except (RuntimeError, OSError) as error:
-            if not left:
-                raise RunError(f"the workers do not start ({error}); --resume goes on with what is done.") from error
-    raise AssertionError
-
-
 @contextmanager
-def joined_workers(address: str) -> Iterator[Workers]:
-    """Use the workers of a running scheduler; they must see the dataset at the same path."""
-    from distributed import Client
+def joined_workers(address: str) -> Iterator[ClusterWorkers]:
+    """Use the workers of a running scheduler; they must see the dataset at the same path.
+
+    For addresses tls:// the certificates are those of Dask's configuration.
+    """
+    try:
+        from distributed import Client
+    except ImportError:
+        raise InputError('--scheduler needs Dask, which pip install "mpmcli[cluster]" installs.') from None
 
     with _quiet_dask():
         try:
@@ -336,7 +415,7 @@ def joined_workers(address: str) -> Iterator[Workers]:
         except (OSError, ValueError) as error:
             raise InputError(f"--scheduler {address}: no scheduler answers there; give tcp://HOST:PORT.") from error
         with client:
-            workers = Workers(client)
+            workers = ClusterWorkers(client)
             if workers.count == 0:
                 raise InputError(f"--scheduler {address}: this scheduler has no worker; start dask worker {address}.")
             yield workers

@@ -41,6 +41,22 @@ def interrupts_blocked() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
+@contextmanager
+def sharing_cores(count: int) -> Iterator[None]:
+    """Give `count` processes started in this context their share of the cores, unless the environment says otherwise.
+
+    Libraries read the variables of THREADS when they are loaded.
+    """
+    share = str(max(1, available_cores() // count))
+    threads = {name: share for name in THREADS if name not in os.environ}
+    os.environ.update(threads)
+    try:
+        yield
+    finally:
+        for name in threads:
+            del os.environ[name]
+
+
 @dataclass(frozen=True)
 class Fault:
     """The reason of a missing result, such as "its process ended with exit code 3"."""
@@ -181,18 +197,10 @@ def _render_beside(
     job: Job, ks: Sequence[int], count: int, watch: Callable[[int, Any], None], stop: Callable[[], bool]
 ) -> None:
     others = set(multiprocessing.active_children())
-    # Libraries read these variables when they are loaded, together with the job.
-    share = str(max(1, available_cores() // count))
-    threads = {name: share for name in THREADS if name not in os.environ}
     pool = ProcessPoolExecutor(count, SPAWN, _begin, (job,))
     try:
-        os.environ.update(threads)
-        try:
-            with interrupts_blocked():
-                waiting = {pool.submit(_render, k): k for k in ks}
-        finally:
-            for name in threads:
-                del os.environ[name]
+        with interrupts_blocked(), sharing_cores(count):
+            waiting = {pool.submit(_render, k): k for k in ks}
         while waiting:
             if stop():
                 raise KeyboardInterrupt
@@ -235,10 +243,10 @@ def _begin(job: Job) -> None:
     # SIGTERM raises KeyboardInterrupt, which handlers of errors do not catch.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     silence()
-    threading.Thread(target=_follow, daemon=True).start()
+    threading.Thread(target=follow_parent, daemon=True).start()
 
 
-def _follow() -> None:
+def follow_parent() -> None:
     """End this process when its parent ends, which may be killed."""
     connection.wait([multiprocessing.parent_process().sentinel])
     os._exit(1)
