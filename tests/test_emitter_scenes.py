@@ -10,8 +10,10 @@ from solver_state import scene_of
 
 from mpmcli.errors import InputError
 from mpmcli.scene import Scene, estimate_particles, sample_bodies, scene_to_toml
-from mpmcli.scene.sheets import mouth_of, sheets_of
+from mpmcli.scene.sheets import fastest_inflow, mouth_of, sheets_of
 
+# For integrals of rates.
+TIMES = np.linspace(0.0, 1.0, 20_001)
 WATER = {"law": "fluid", "density": 1000.0, "bulk_modulus": 2e4}
 JET = {"name": "jet", "material": WATER, "shape": {"box": {"min": [0.1, 0.2], "max": [0.3, 0.5]}}}
 GOOD_JET = """\
@@ -103,7 +105,7 @@ def test_a_stream_of_the_turned_sequence_has_no_rows_that_part(d, sampling):
 def test_all_particles_are_sampled_and_counted():
     scene = jet_scene(start=0.25, end=0.75)
     pool, jet = sample_bodies(scene)
-    assert jet.waits and not pool.waits and not jet.velocity.any()
+    assert jet.waits and not pool.waits and (jet.velocity == [2.0, 0.0]).all()
     assert len(jet.position) == sheets_of(scene.emitters[0], scene).particles == 40 * 12
     assert estimate_particles(scene) == len(pool.position) + len(jet.position)
     # What has come out is all that flows through the mouth in this time.
@@ -178,3 +180,39 @@ def test_solids_on_grids_of_their_own_know_neither():
     tables = jet_scene().model_dump(exclude_none=True, exclude={"domain": {"cells"}})
     with pytest.raises(InputError, match='solids = "total" supports no emitters'):
         scene_of(**tables | {"solver": {"solids": "total"}})
+
+
+RATES = {
+    "pulses": ("0.02 * (1 + sin(10*t))", lambda t: 0.02 * (t + (1 - np.cos(10 * t)) / 10)),
+    "ramp": ("0.08 * t", lambda t: 0.04 * t**2),
+    "valve": ("0.03 if 0.2 < t and t < 0.7 else 0", lambda t: 0.03 * np.clip(t - 0.2, 0.0, 0.5)),
+    "number": (0.025, lambda t: 0.025 * t),
+}
+
+
+@pytest.mark.parametrize("name", RATES)
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_sheets_of_a_rate_that_varies(dimension: int, name: str) -> None:
+    """The volume that is due by any time is the integral of the rate, to a sheet; each sheet enters at rate / area."""
+    rate, volume = RATES[name]
+    d, low, high = dimension, [0.2] * dimension, [0.4] * dimension
+    asked = jet_scene(d, velocity=[0.0] * (d - 1) + [-3.0], rate=rate, shape={"box": {"min": low, "max": high}})
+    sheets = sheets_of(asked.emitters[0], asked)
+    own = sheets.size * sheets.volume
+    entered = own * np.arange(1, sheets.count)
+    assert entered == pytest.approx(volume(sheets.due[1:]), abs=own / 100)
+    assert sheets.particles * sheets.volume == pytest.approx(volume(1.0), abs=own)
+    middle = np.interp(own * (np.arange(sheets.count) + 0.5), volume(TIMES), TIMES)
+    expected = np.gradient(volume(TIMES), TIMES) / sheets.mouth.area
+    assert sheets.speeds[:-1] == pytest.approx(np.interp(middle, TIMES, expected)[:-1], rel=0.02, abs=1e-3)
+    assert fastest_inflow(asked.emitters[0], 1.0) == pytest.approx(expected.max(), rel=1e-3)
+    if name == "number":
+        speed = 0.025 / sheets.mouth.area
+        same = jet_scene(d, velocity=[0.0] * (d - 1) + [-speed], shape={"box": {"min": low, "max": high}})
+        assert sheets_of(same.emitters[0], same).due == pytest.approx(sheets.due)
+
+
+@pytest.mark.parametrize("rate", ["t - 0.5", "0", "-1 if t > 0.9 else 1"])
+def test_a_rate_that_is_negative_or_nothing_is_refused(rate: str) -> None:
+    (said,) = refusal(GOOD + GOOD_JET + f'rate = "{rate}"\n')
+    assert "emitters[0].rate: must not be negative, and positive at some time: " in said

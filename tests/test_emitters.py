@@ -123,6 +123,23 @@ def test_the_jet_flows_as_its_velocity_says(jet: Output) -> None:
         assert not frame.velocity[status == 0].any()
 
 
+def test_a_jet_whose_rate_varies(backend_of: Callable[..., Backend]) -> None:
+    """The mass is rho int q dt, to two sheets and a step, and the momentum rho int q^2 dt / area."""
+    pulse = {"velocity": [1.0, 0.0], "rate": "0.2 * (0.6 + 0.4 * cos(9*t))"}
+    emitter = {"name": "jet", "material": WATER, "shape": box([0.1, 0.2], [0.15, 0.3]), **pulse}
+    scene = jet_scene(emitters=[emitter])
+    rows = [row for _, row in outputs_of(batch_of([scene], backend_of("f32", 1)), [scene])[0]]
+    for row in rows:
+        t = np.linspace(0.0, row.time, 1001)
+        q = 0.2 * (0.6 + 0.4 * np.cos(9 * t))
+        late = 2 * 1000.0 * 0.1 * SPACING / 8 + 200.0 * row.step_max
+        assert row.blocked == 0 and row.emitted_mass == pytest.approx(1000.0 * np.trapezoid(q, t), abs=late)
+        if row.retired == 0:
+            momentum = 1000.0 * np.trapezoid(q**2, t) / 0.1
+            assert row.linear_momentum[0] == pytest.approx(momentum, rel=1e-3, abs=late * SPEED)
+    assert rows[2].retired == 0 < rows[-1].retired
+
+
 @pytest.mark.parametrize(("sampling", "uneven", "mean"), [("lattice", 2e-5, 2e-5), ("turned", 0.02, 5e-4)])
 def test_the_jet_leaves_as_if_nothing_were_there(
     jets: dict[str, Output], sampling: str, uneven: float, mean: float

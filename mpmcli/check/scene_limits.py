@@ -154,7 +154,7 @@ def _motion_limits(scene: Scene, bounds: SceneBounds, release: float) -> list[Sc
     """Return the limits set by speeds, velocity gradients and colliders, at the start and reachable in the scene."""
     h = scene.domain.spacing
     cell = f"a cell is {h:.4g} m wide"
-    starting = {source.name: highest_speed(source) for source in scene.sources}
+    starting = {source.name: highest_speed(source, scene.time.end) for source in scene.sources}
     fastest = max(starting, key=lambda name: starting[name], default="")
     initial, reached = starting.get(fastest, 0.0), bounds.speed
     jets = JET * math.sqrt(max(reached**2 - release**2, 0.0)) + SPRAY * release

@@ -1,5 +1,6 @@
 """Bounds on speed, depth and density that a scene can reach, computed from its initial state alone."""
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -14,6 +15,7 @@ from mpmcli.scene.primitives import grid_points
 from mpmcli.scene.quadrature import parts_of
 from mpmcli.scene.sampling import estimate_body, initial_motion, moves_unevenly, particle_places
 from mpmcli.scene.schema import Body, Emitter, Force, Scene
+from mpmcli.scene.sheets import fastest_inflow
 
 # Number of equal parts of a run, in addition to those in which a time-dependent term varies; largest number of parts.
 SLICES, MOST_SLICES = 32, 400
@@ -214,7 +216,7 @@ def reaching(source: Body | Emitter, scene: Scene) -> list[Body | Emitter]:
     found = []
     for other in scene.sources:
         solid = isinstance(other, Body) and other.material.solid
-        stands = steady and solid and not (impelled & {None, other.name} or highest_speed(other) > 0)
+        stands = steady and solid and not (impelled & {None, other.name} or highest_speed(other, scene.time.end) > 0)
         if stands and gravity.any():
             above = _falls(scene, _corners(*other.shape.form.bounds()), gravity)
             stands = float(np.min(above)) < scene.domain.spacing
@@ -252,7 +254,7 @@ def scene_bounds(scene: Scene, sources: Sequence[Body | Emitter] | None = None) 
         )
     g = pull.largest
     pushed_by = [collider.fastest(scene.domain, scene.time.end) for collider in scene.colliders]
-    initial = max([scene.domain.wall_speed, *pushed_by, *(highest_speed(body) for body in sources)])
+    initial = max([scene.domain.wall_speed, *pushed_by, *(highest_speed(body, scene.time.end) for body in sources)])
     closed = ~np.array(scene.domain.periodic)
     # Without material the rigid bodies are what falls.
     forms = [body.shape.form for body in sources] or [one.form for one in scene.colliders if one.free]
@@ -278,14 +280,16 @@ def scene_bounds(scene: Scene, sources: Sequence[Body | Emitter] | None = None) 
     )
 
 
-def highest_speed(body: Body | Emitter) -> float:
-    """Return a bound on the initial speed of a body, m/s: the largest at the corners of its bounding box.
+def highest_speed(body: Body | Emitter, end: float = math.inf) -> float:
+    """Return a bound on the initial speed of a body, or of the inflow of an emitter until `end`, s: m/s.
+
+    It is the largest at the corners of the bounding box.
 
     For a velocity that is an expression, it is the largest over a lattice of points of the body. The largest velocity
     given with the points of a file is added.
     """
     if isinstance(body, Emitter):
-        return float(np.linalg.norm(body.velocity))
+        return fastest_inflow(body, end)
     form, velocity = body.shape.form, body.velocity
     if moves_unevenly(body):
         speeds = np.linalg.norm(initial_motion(body, body_points(body))[0], axis=1)

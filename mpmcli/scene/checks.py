@@ -8,12 +8,12 @@ import numpy as np
 
 from mpmcli.scene.bounds import body_places
 from mpmcli.scene.colliders import Collider, Plane, has_jump, slope_of
-from mpmcli.scene.entry import entries_in
+from mpmcli.scene.entry import entries_in, tree_of, value_of, varies
 from mpmcli.scene.expression import Expression
 from mpmcli.scene.mesh import Mesh, leaving, moved_inside
 from mpmcli.scene.primitives import Polygon, TurnedBox, grid_points
 from mpmcli.scene.problem import Problem, hint_at, listed
-from mpmcli.scene.quadrature import integral_of, parts_of
+from mpmcli.scene.quadrature import integral_of, parts_of, telling_times
 from mpmcli.scene.quantity import AXES, place_text
 from mpmcli.scene.sampling import (
     has_expressions,
@@ -95,6 +95,15 @@ def _in_the_way(emitter: Emitter, places: np.ndarray, scene: Scene) -> Iterator[
 
 
 def _emitted(emitter: Emitter, scene: Scene) -> Iterator[tuple[str, str]]:
+    if emitter.rate is not None:
+        until = scene.time.end if emitter.end is None else min(scene.time.end, emitter.end)
+        times = np.array([emitter.start, *telling_times(tree_of(emitter.rate), emitter.start, until)])
+        rates = np.broadcast_to(value_of(emitter.rate, t=times), times.shape)
+        if not (rates >= 0).all() or not rates.any():
+            t = times[np.argmax(~(rates >= 0))]
+            found = "nothing flows" if not rates.any() else f"at t = {t:.4g} s it is {rates[times == t][0]:.4g}"
+            yield "rate", f"must not be negative, and positive at some time: {found}"
+            return
     sheets = sheets_of(emitter, scene)
     most = most_until_end(emitter, scene, sheets.period, sheets.size)
     for key, unit, one in (("particles", "particles", 1.0), ("volume", "m^3", sheets.volume)):
@@ -103,6 +112,9 @@ def _emitted(emitter: Emitter, scene: Scene) -> Iterator[tuple[str, str]]:
             end = "end" if emitter.end is not None else "time.end"
             unit = "m^2" if key == "volume" and scene.dimension == 2 else unit
             pace = sheets.period / sheets.size
+            if varies(emitter.rate):
+                yield key, f'is more than "{emitter.name}" lets in until {end}: {most * one:.6g} {unit} at most'
+                continue
             yield (
                 key,
                 f'takes {asked / one * pace:.4g} s to flow out of "{emitter.name}", which has '

@@ -328,7 +328,8 @@ def sample_bodies(scene: Scene) -> list[BodyParticles]:
         n, d = position.shape
         affine = np.broadcast_to(np.zeros((d, d)), (n, d, d))
         mass = emitter.material.density * sheets.volume
-        found.append(BodyParticles(emitter.name, position, np.zeros((n, d)), affine, sheets.volume, mass, waits=True))
+        velocity = sheets.velocities()
+        found.append(BodyParticles(emitter.name, position, velocity, affine, sheets.volume, mass, waits=True))
     return found
 
 

@@ -15,7 +15,7 @@ from pydantic import (
 
 from mpmcli.scene.colliders import Collider
 from mpmcli.scene.domain import Domain
-from mpmcli.scene.entry import ConstantTable, StartDeformation, StartMatrix, StartVector
+from mpmcli.scene.entry import ConstantTable, OfTime, StartDeformation, StartMatrix, StartVector
 from mpmcli.scene.forces import Contact, Force, Impulse
 from mpmcli.scene.material import MaterialParameters
 from mpmcli.scene.quantity import NAME, Flag, Integer, NotNegative, Positive, Table, Vector, flaw, scene_dimension
@@ -69,7 +69,7 @@ Material = Annotated[
 
 
 class Emitter(Table):
-    """A mouth from which material flows at a constant velocity.
+    """A mouth from which material flows along a constant direction.
 
     The mouth is the section of the shape through its centre, across the velocity. Particles move with the velocity, in
     sheets: a layer as thick as the particle distance enters as one sheet or as eight.
@@ -81,6 +81,11 @@ class Emitter(Table):
     material: Material
     shape: OneShape = Field(description="Its section through the centre, across the velocity, is the mouth.")
     velocity: Vector = Field(description="Velocity of the inflow, m/s; not zero.")
+    rate: OfTime | None = Field(
+        None,
+        description="Volume flow, m^3/s (m^2/s in 2D), a number or an expression of t; velocity is then the direction "
+        "only. Default: the area of the mouth times the speed.",
+    )
     start: NotNegative = Field(0.0, description="Time at which the first sheet enters, s.")
     end: Positive | None = Field(
         None, description="Time from which on no sheet enters, s. Default: the end of the scene."

@@ -10,7 +10,9 @@ from functools import lru_cache
 
 import numpy as np
 
+from mpmcli.scene.entry import tree_of, value_of, varies
 from mpmcli.scene.primitives import grid_points
+from mpmcli.scene.quadrature import largest_of
 from mpmcli.scene.schema import Emitter, Scene
 from mpmcli.scene.shapes import Shape
 
@@ -18,6 +20,10 @@ from mpmcli.scene.shapes import Shape
 _MEASURED = {2: 4096, 3: 768}
 # Sheets late by at most this fraction of a period count as on time.
 _SLACK = 1e-9
+# Instants at which a varying rate is integrated; a jump of the rate costs half an interval.
+_INSTANTS = 2**15 + 1
+# Speed, m/s, and area below which nothing flows.
+_SLOWEST = _TINY = 1e-300
 # Sheets per layer, if a layer is divided.
 _PER_LAYER = 8
 # Golden and plastic number, the smallest real roots above 1 of z^2 = z + 1 and z^3 = z + 1.
@@ -55,13 +61,23 @@ class Sheets:
     size: int  # particles of one; the last one may have fewer
     per_layer: int  # sheets of a layer
     particles: int  # of all sheets
-    period: float  # between two of them, s
-    start: float  # when the first one is due, s
+    period: float  # between two of them at the largest speed, s
+    due: np.ndarray  # when each is due, (count,), s
+    speeds: np.ndarray  # at which each enters, (count,), m/s
     volume: float  # of a particle at rest, m^3 (m^2 in 2D)
 
     @property
     def count(self) -> int:
         return -(-self.particles // max(1, self.size))
+
+    @property
+    def stretches(self) -> np.ndarray:
+        """Time from each sheet to the next one over `period`, (count,)."""
+        return np.diff(self.due, append=self.due[-1:] + self.period) / self.period
+
+    def velocities(self) -> np.ndarray:
+        """Return the velocities at which all particles enter, (n, d), m/s."""
+        return self.speeds[np.arange(self.particles) // self.size, None] * self.mouth.direction
 
     def places(self, emitter: Emitter) -> np.ndarray:
         """Return the positions of entry of all particles, (n, d), m, in the order of entry.
@@ -82,7 +98,7 @@ class Sheets:
             cells = (filled[order] + random[..., 1:]).reshape(-1, len(mouth.counts))[number]
         else:
             cells, due = _even_cells(mouth, emitter.shape, self.particles), (number + 0.5) / self.size
-        ahead = (number // self.size + 1 - due) * (self.period * np.linalg.norm(emitter.velocity))
+        ahead = (number // self.size + 1 - due) * (mouth.spacing[0] * self.size / max(1, len(filled)))
         return mouth.place(cells) + ahead[:, None] * mouth.direction
 
 
@@ -110,7 +126,8 @@ def mouth_of(emitter: Emitter, h: float) -> Mouth:
 
 
 @lru_cache(maxsize=64)
-def _mouth(shape: Shape, velocity: tuple[float, ...], particles_per_cell: int, h: float) -> Mouth:
+def _opening(shape: Shape, velocity: tuple[float, ...]) -> tuple[np.ndarray, ...]:
+    """Return direction, centre, axes, reach, steps of a fine lattice across, and which of its points are inside."""
     d, form = len(velocity), shape.form
     direction = np.array(velocity) / np.linalg.norm(velocity)
     centre, axes, reach = _section(shape, direction)
@@ -118,8 +135,20 @@ def _mouth(shape: Shape, velocity: tuple[float, ...], particles_per_cell: int, h
     n = _MEASURED[d]
     steps = 2 * reach / n
     fine = grid_points(*[-r + (np.arange(n) + 0.5) * s for r, s in zip(reach, steps, strict=True)])
-    inside = form.contains(centre + fine @ axes).reshape((n,) * (d - 1))
-    area = float(inside.sum() * np.prod(steps))
+    return direction, centre, axes, reach, steps, form.contains(centre + fine @ axes).reshape((n,) * (d - 1))
+
+
+def _area(shape: Shape, velocity: tuple[float, ...]) -> float:
+    """Return the area of the section, m^2 (m in 2D)."""
+    *_, steps, inside = _opening(shape, velocity)
+    return float(inside.sum() * np.prod(steps))
+
+
+@lru_cache(maxsize=64)
+def _mouth(shape: Shape, velocity: tuple[float, ...], particles_per_cell: int, h: float) -> Mouth:
+    d, form = len(velocity), shape.form
+    direction, centre, axes, reach, steps, inside = _opening(shape, velocity)
+    area, n = _area(shape, velocity), _MEASURED[d]
     spacing = h / particles_per_cell ** (1 / d)
     low, counts, spacings = [], [], [spacing]
     for a in range(d - 1):
@@ -168,17 +197,45 @@ def sheets_of(emitter: Emitter, scene: Scene) -> Sheets:
     layer, whole = int(mouth.filled.sum()), emitter.sampling == "lattice"
     size = layer if whole else max(1, round(layer / _PER_LAYER))
     volume = mouth.area * float(mouth.spacing[0]) / max(1, layer)
-    period = float(mouth.spacing[0] / np.linalg.norm(emitter.velocity)) * size / max(1, layer)
+    speed = fastest_inflow(emitter, scene.time.end)
+    period = float(mouth.spacing[0] / max(speed, _SLOWEST)) * size / max(1, layer)
     step = size if whole else 1
     totals = [most_until_end(emitter, scene, period, size)]
     totals += [emitter.particles] * (emitter.particles is not None)
     if emitter.volume is not None and volume > 0:
         totals.append(emitter.volume / volume)
     particles = step * max(1, round(min(totals) / step)) if totals[0] and layer else 0
-    return Sheets(mouth, size, max(1, round(layer / max(1, size))), particles, period, emitter.start, volume)
+    number = np.arange(-(-particles // max(1, size)))
+    due, speeds = emitter.start + number * period, np.full(len(number), speed)
+    if varies(emitter.rate):
+        times, flown = _flow(emitter, scene)
+        due = np.interp(number * size * volume, flown, times)
+        middle = np.interp((number + 0.5) * size * volume, flown, times)
+        speeds = np.maximum(value_of(emitter.rate, t=middle), 0.0) / mouth.area
+    return Sheets(mouth, size, max(1, round(layer / max(1, size))), particles, period, due, speeds, volume)
+
+
+def fastest_inflow(emitter: Emitter, end: float) -> float:
+    """Return the largest speed of the inflow of an emitter in a scene until `end`, s: m/s."""
+    if emitter.rate is None:
+        return float(np.linalg.norm(emitter.velocity))
+    until = end if emitter.end is None else min(end, emitter.end)
+    return largest_of(tree_of(emitter.rate), emitter.start, until) / max(_area(emitter.shape, emitter.velocity), _TINY)
+
+
+def _flow(emitter: Emitter, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Return times, s, and the volume that has flown in until then, m^3 (m^2 in 2D)."""
+    until = scene.time.end if emitter.end is None else min(scene.time.end, emitter.end)
+    times = np.linspace(emitter.start, until, _INSTANTS)
+    rates = np.maximum(np.broadcast_to(value_of(emitter.rate, t=times), times.shape), 0.0)
+    return times, np.concatenate([[0.0], np.cumsum((rates[1:] + rates[:-1]) / 2 * np.diff(times))])
 
 
 def most_until_end(emitter: Emitter, scene: Scene, period: float, size: int) -> int:
     """Return the number of particles that enter until the end of an emitter or its scene, in sheets of a size."""
     end = min(scene.time.end, math.inf if emitter.end is None else emitter.end)
-    return max(0, math.ceil((end - emitter.start) / period - _SLACK)) * size
+    sheets = (end - emitter.start) / period
+    if varies(emitter.rate) and end > emitter.start:
+        mouth = mouth_of(emitter, scene.domain.spacing)
+        sheets = _flow(emitter, scene)[1][-1] / (mouth.area * float(mouth.spacing[0])) * mouth.filled.sum() / size
+    return max(0, math.ceil(sheets - _SLACK)) * size

@@ -93,13 +93,14 @@ class CompiledKind:
 
     def padded(self) -> "CompiledKind":
         """Return the kind with padded sizes, so that few sizes occur and compiled kernels are reused."""
+        sizes = {"cells": self.inflow.cells, "sheets": self.inflow.sheets}
         return replace(
             self,
             cells=self.cells if self.sparse else padded_cells(self.cells),
             particles=tuple(map(in_steps, self.particles)),
             bodies=tuple(map(power_of_two, self.bodies)),
             colliders=padded_colliders(self.colliders),
-            inflow=replace(self.inflow, cells=power_of_two(self.inflow.cells) if self.inflow.cells else 0),
+            inflow=replace(self.inflow, **{name: power_of_two(size) for name, size in sizes.items() if size}),
         )
 
     def joined(self, other: "CompiledKind") -> "CompiledKind | None":
@@ -113,6 +114,6 @@ class CompiledKind:
         room["colliders"] = self.colliders.joined(other.colliders)
         if room["colliders"] is None:
             return None
-        cells = max(self.inflow.cells, other.inflow.cells)
-        wide, fits = (replace(one, inflow=replace(one.inflow, cells=cells), **room) for one in (self, other))
+        both = self.inflow, other.inflow
+        wide, fits = (replace(one, inflow=one.inflow.with_room_for(*both), **room) for one in (self, other))
         return wide if fits == wide else None

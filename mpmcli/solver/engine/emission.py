@@ -66,7 +66,7 @@ class CpuEmission:
                         self.widen(orders[g], w, p)
                     run.entered[e] = sheet + 1
                     run.waits[e] = 0
-                    run.due_of[e] = run.due_of[e] + run.period[e]
+                    run.due_of[e] = run.due_of[e] + run.period[e] * self.emission.stretch(e, w, sheet)
                 going = self.is_left(e, run)
             if going:
                 due = ti.min(due, run.due_of[e])
@@ -163,7 +163,8 @@ class GpuEmission:
         runs.blocked[enters] += blocked[enters]
         runs.entered[e][enters] += 1
         runs.waits[e][enters] = 0
-        runs.due_of[e][enters] += runs.period[e][enters]
+        stretches = self.emission.known[np.arange(self.runs), e, np.minimum(sheet, self.emission.sheets - 1)]
+        runs.due_of[e][enters] += (runs.period[e] * stretches)[enters]
         self.enters.from_numpy(enters.astype(np.int32))
         self.let_enter(e)
 
@@ -222,13 +223,14 @@ def begin_emission(batch: object, slot: int, scene: Scene, particles: Sequence[i
         particles: number of particles of each source.
     """
     run = batch.state(slot)
-    run.slowest = max((highest_speed(emitter) for emitter in scene.emitters), default=0.0)
+    run.slowest = max((highest_speed(emitter, scene.time.end) for emitter in scene.emitters), default=0.0)
     if batch.device.emission is None:
         return
     found = batch.device.emission.write(scene, first_ids(scene, particles), slot)
     for e, (sheets, emitter) in enumerate(zip(found, scene.emitters, strict=True)):
         # A sheet enters at the first step after its due time; no sheet is due from `until` on.
-        run.due_of[e], run.period[e], run.sheets[e] = sheets.start, sheets.period, sheets.count
+        start = float(sheets.due[0]) if sheets.count else emitter.start
+        run.due_of[e], run.period[e], run.sheets[e] = start, sheets.period, sheets.count
         run.until[e] = min(scene.time.end, math.inf if emitter.end is None else emitter.end)
-        if sheets.count and sheets.start < run.until[e]:
-            run.due = min(run.due, sheets.start)
+        if sheets.count and start < run.until[e]:
+            run.due = min(run.due, start)

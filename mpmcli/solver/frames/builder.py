@@ -327,6 +327,8 @@ class FrameBuilder:
                 fields[name][:, rows] = values
             if status is not None:
                 status[:, rows] = own["activity"]
+                # On the device those that wait have the velocity at which they will enter.
+                velocity[:, rows][np.isin(status[:, rows], (WAITING, BLOCKED))] = 0.0
             totals.add(own["x"], ratios, same, constants.body[rows], None if status is None else status[:, rows])
         if self._initial is not None:
             fields["initial_position"] = np.broadcast_to(self._initial, position.shape)

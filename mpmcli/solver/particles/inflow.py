@@ -8,7 +8,7 @@ are sorted again.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,7 +16,8 @@ from mpmcli.boundaries.rows import Rows
 from mpmcli.frames.frame import ACTIVE, BLOCKED, WAITING
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
-from mpmcli.scene.sheets import Sheets, sheets_of
+from mpmcli.scene.entry import varies
+from mpmcli.scene.sheets import Sheets, fastest_inflow, sheets_of
 from mpmcli.solver.particles.sort import entry_count
 
 # Delay before a layer of which half or more is blocked tries again, as a fraction of the time in which a layer enters.
@@ -31,18 +32,27 @@ class Inflow:
         groups: per emitter, the index of its law among the laws of the run.
         cells: upper bound of the number of cells of the lattice of a mouth.
         opens: (axis, side) of every open face.
+        sheets: upper bound of the number of sheets of an emitter whose rate varies; 0 without any.
     """
 
     groups: tuple[int, ...] = ()
     cells: int = 0
     opens: tuple[tuple[int, int], ...] = ()
+    sheets: int = 0
 
     @staticmethod
     def of(scene: Scene, laws: Sequence[str]) -> "Inflow":
         """Return the constants of a scene; `laws` are the names of the laws in order."""
         groups = tuple(laws.index(emitter.material.law) for emitter in scene.emitters)
-        cells = max((sheets_of(emitter, scene).mouth.filled.size for emitter in scene.emitters), default=0)
-        return Inflow(groups, cells, open_faces(scene.domain.walls.faces(scene.dimension)))
+        found = [(emitter, sheets_of(emitter, scene)) for emitter in scene.emitters]
+        cells = max((sheets.mouth.filled.size for _, sheets in found), default=0)
+        timed = max((sheets.count for emitter, sheets in found if varies(emitter.rate)), default=0)
+        return Inflow(groups, cells, open_faces(scene.domain.walls.faces(scene.dimension)), timed)
+
+    def with_room_for(self, *others: "Inflow") -> "Inflow":
+        """Return it with space for others; the code of varying rates is not that of constant ones."""
+        cells, sheets = (max(getattr(one, name) for one in others) for name in ("cells", "sheets"))
+        return replace(self, cells=cells, sheets=sheets if self.sheets else 0)
 
     @property
     def any(self) -> bool:
@@ -68,10 +78,13 @@ class Emission:
         ids: (runs, emitters) Vector: first id, particles per sheet, sheets per layer, and particles of all sheets.
         centre: centre of the mouth relative to the origin of the domain, m.
         axes: axes of the mouth as rows, the first along the flow.
-        velocity: velocity of emitted particles, m/s.
+        velocity: largest velocity of emitted particles, m/s.
         spacing, low: spacing and lower bound of the lattice along these axes, m.
         cells: number of cells along these axes, 1 along the flow.
         marks: (runs * emitters, cells) int, whether a cell is occupied.
+        stretches: (runs, emitters, sheets), time from a sheet to the next one over that at the largest speed; and
+            known: the same on the host.
+        sheets: `Inflow.sheets`, at least 1.
     """
 
     def __init__(self, inflow: Inflow, dimension: int, runs: int = 1) -> None:
@@ -85,21 +98,30 @@ class Emission:
         self.axes = ti.Matrix.field(d, d, float, shape=(runs, n))
         self.cells = ti.Vector.field(d, int, shape=(runs, n))
         self.marks = ti.field(int, shape=(runs * n, max(1, inflow.cells)))
-        self._rows = Rows(self.ids, self.centre, self.axes, self.velocity, self.spacing, self.low, self.cells)
+        self._timed, self.sheets = inflow.sheets > 0, max(1, inflow.sheets)
+        self.stretches, self.known = ti.field(float, shape=(runs, n, self.sheets)), np.ones((runs, n, self.sheets))
+        own = self.velocity, self.spacing, self.low, self.cells, self.stretches
+        self._rows = Rows(self.ids, self.centre, self.axes, *own)
 
     def write(self, scene: Scene, ids: Sequence[int], run: int = 0) -> list[Sheets]:
         """Set the mouths of a run, given the first ids of its emitters; return the sheets of each."""
         found = [sheets_of(emitter, scene) for emitter in scene.emitters]
         mouths = [sheets.mouth for sheets in found]
+        pairs = zip(scene.emitters, mouths, strict=True)
+        self.known[run] = 1.0
+        for e, (emitter, sheets) in enumerate(zip(scene.emitters, found, strict=True)):
+            if varies(emitter.rate):
+                self.known[run, e, : sheets.count] = sheets.stretches
         self._rows.write(
             run,
             [[[own, one.size, one.per_layer, one.particles] for own, one in zip(ids, found, strict=True)]],
             [[mouth.centre - np.array(scene.domain.origin) for mouth in mouths]],
             [[np.vstack([mouth.direction, mouth.across]) for mouth in mouths]],
-            [[emitter.velocity for emitter in scene.emitters]],
+            [[mouth.direction * fastest_inflow(one, scene.time.end) for one, mouth in pairs]],
             [[mouth.spacing for mouth in mouths]],
             [[[-0.5 * mouth.spacing[0], *mouth.low] for mouth in mouths]],
             [[[1, *mouth.counts] for mouth in mouths]],
+            self.known[run : run + 1],
         )
         return found
 
@@ -116,7 +138,8 @@ class Emission:
         enough yet.
         """
         if not self.is_due(e, group, run, p, ti.max(sheet - self.ids[run, e][2] + 1, 0), self.ids[run, e][2]):
-            index, inside = self.cell_of(e, run, group.x[p] - late * self.velocity[run, e])
+            moved = late * self.velocity[run, e] / self.stretch(e, run, sheet)
+            index, inside = self.cell_of(e, run, group.x[p] - moved)
             if inside:
                 self.marks[self.row(e, run), index] = 1
 
@@ -180,13 +203,19 @@ class Emission:
                 group.activity[p] = BLOCKED
 
     @ti.func
+    def stretch(self, e: ti.template(), run: int, sheet: int):
+        """Return the time from a sheet to the next one over that at the largest speed."""
+        result = 1.0
+        if ti.static(self._timed):
+            result = self.stretches[run, e, sheet]
+        return result
+
+    @ti.func
     def begin(self, e: ti.template(), group: ti.template(), run: int, p: int, late: float):
-        """Activate particle p of a sheet that was due `late` s ago."""
+        """Activate particle p of a sheet that was due `late` s ago, whose velocity it has."""
         group.activity[p] = ACTIVE
-        velocity = self.velocity[run, e]
         for c in ti.static(range(self.dimension)):
-            group.x[p][c] += late * velocity[c]
-            group.v[p][c] = velocity[c]
+            group.x[p][c] += late * group.v[p][c]
 
     @ti.func
     def enter(self, e: ti.template(), group: ti.template(), run: int, sheet: int, late: float, active: int, after: int):

@@ -144,7 +144,7 @@ def floor_of(scene: Scene, law: Law, members: Sequence[int]) -> np.ndarray | Non
     """Return maxima for undeformed particles at the speed of the emitters; None if some particle is always there."""
     if scene.bodies and not scene.comes_and_goes:
         return None
-    speeds = [highest_speed(scene.sources[i]) for i in members if i >= len(scene.bodies)]
+    speeds = [highest_speed(scene.sources[i], scene.time.end) for i in members if i >= len(scene.bodies)]
     at_rest = [value for v in law.internal for value in (float(v.at_rest), -float(v.at_rest))]
     return np.array([max(speeds, default=0.0) ** 2, 0.0, 1.0, -1.0, 1.0, *at_rest])
 

@@ -40,7 +40,7 @@ def own_limit(source: Body | Emitter, law: Law, scene: Scene) -> float:
     modes = law.reference_modes if scene.solver.solids == "total" else law.modes
     found = modes(material, StateBound())
     stiffness = (mode_limit(h, material.density, mode.stiffness, mode.viscosity, inertia)[0] for mode in found)
-    return min(*stiffness, speed_limit(h, highest_speed(source), 0.0))
+    return min(*stiffness, speed_limit(h, highest_speed(source, scene.time.end), 0.0))
 
 
 @ti.pyfunc
