@@ -13,6 +13,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+import pyvista
 from command import run_here
 from made_dataset import COUNTS, PAUSE, SPLITS, made_dataset, made_header, made_trajectory, write_dataset
 from made_result import write_made
@@ -375,6 +376,23 @@ def test_vtkhdf_of_a_result_has_the_bytes_that_simulate_packs(tmp_path, dimensio
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
+def test_a_vtu_of_each_frame_is_what_vtk_reads(tmp_path, dimension):
+    """Of every second frame of a result: times, positions, velocities, and a field of each particle."""
+    path = write_made(tmp_path / "run", dimension=dimension)
+    exported(path, "vtk", tmp_path / "out", "--stride", 2)
+    reader, result = pyvista.get_reader(tmp_path / "out" / "000000.pvd"), open_result(path)
+    frames = list(result.frames())[::2]
+    assert reader.time_values == pytest.approx([frame.time for frame in frames])
+    for k, frame in enumerate(frames):
+        reader.set_active_time_point(k)
+        (points,) = reader.read()
+        np.testing.assert_array_equal(points.points[:, :dimension], frame.position)
+        np.testing.assert_array_equal(points["velocity"][:, :dimension], frame.velocity)
+        np.testing.assert_array_equal(points["body"], frame.body)
+        assert points["id"].tolist() == list(range(len(frame.position)))
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
 def test_vtkhdf_of_a_dataset_opens_as_a_result(tmp_path, dimension):
     path = made_dataset(tmp_path / "set", dimension=dimension)
     answer = exported(path, "vtkhdf", tmp_path / "out", "--trajectory", 2)
@@ -419,6 +437,9 @@ def test_fewer_particles_are_the_same_ones_in_every_format_and_frame(tmp_path, f
         found = GnsReader(tmp_path / "out" / "train.npz").data[0][0]
     elif form == "npz":
         found = np.load(tmp_path / "out" / "000000.npz")["position"]
+    elif form == "vtk":
+        files = sorted((tmp_path / "out").glob("000000_*.vtu"))
+        found = np.stack([pyvista.read(file).points[:, :2] for file in files])
     else:
         found = np.stack([f.position for f in open_result(tmp_path / "out" / "000000.vtkhdf").frames()])
     np.testing.assert_array_equal(found, expected)

@@ -166,7 +166,7 @@ def merge(parts: tuple[Path, ...], output: Path, as_json: bool) -> None:
 @click.option(
     "--to",
     "form",
-    type=click.Choice(["lagrangebench", "gns", "npz", "vtkhdf"]),
+    type=click.Choice(["lagrangebench", "gns", "npz", "vtkhdf", "vtk"]),
     required=True,
     help="The training code of LagrangeBench or GNS, NumPy, or ParaView and all commands that read results.",
 )

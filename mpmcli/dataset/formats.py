@@ -24,8 +24,10 @@ from mpmcli.dataset.shard import LABELS, MOVING, SPLITS, group_name
 from mpmcli.dataset.subsample import KINDS, SubsampledTrajectory
 from mpmcli.errors import InputError
 from mpmcli.frames.ledger import RIGID
+from mpmcli.output.collider_files import pvd_text
 from mpmcli.output.durable import ask_for
 from mpmcli.output.layout import POSITION
+from mpmcli.output.series import series_size, write_vtu
 from mpmcli.output.vtkhdf import VtkhdfWriter, file_size
 from mpmcli.scene.colliders import Motion
 from mpmcli.scene.problem import listed
@@ -372,7 +374,9 @@ class Vtkhdf(Format):
 
     def check(self) -> None:
         if any(each.walls.walls != "none" for each in self.trajectories):
-            raise InputError("--walls is for training code and NumPy; of a vtkhdf mpmcli render draws the colliders.")
+            raise InputError(
+                "--walls is for training code and NumPy; of files for VTK mpmcli render draws the colliders."
+            )
 
     def size(self) -> int:
         return sum(file_size(each.layout, [each.particle_count] * each.frame_count) for each in self.trajectories)
@@ -381,8 +385,7 @@ class Vtkhdf(Format):
         for each in self.trajectories:
             path = directory / f"{group_name(each.source.number)}.vtkhdf"
             n, frames, layout = each.particle_count, each.frame_count, each.layout
-            # Constant over all frames.
-            fixed = {name: each.label(name) for name in LABELS} | {"id": np.arange(n, dtype=layout.arrays["id"].dtype)}
+            fixed = _fixed(each)
             ask_for(path, file_size(layout, [n] * frames))
             with VtkhdfWriter(path, layout, [n] * frames) as writer:
                 for name, array in layout.arrays.items():
@@ -400,6 +403,36 @@ class Vtkhdf(Format):
         )
         note = "The headers and ledgers stay those of the whole runs: mpmcli check finds frames missing."
         return {}, [] if whole else [note]
+
+
+def _fixed(trajectory: SubsampledTrajectory) -> dict[str, np.ndarray]:
+    """Return the arrays that are the same in all frames."""
+    ids = np.arange(trajectory.particle_count, dtype=trajectory.layout.arrays["id"].dtype)
+    return {name: trajectory.label(name) for name in LABELS} | {"id": ids}
+
+
+class Vtk(Vtkhdf):
+    """A .vtu file for each frame and a .pvd that lists those of a trajectory, for ParaView before 5.12."""
+
+    def size(self) -> int:
+        return sum(series_size(each.layout, [each.particle_count] * each.frame_count) for each in self.trajectories)
+
+    def write(self, directory: Path, tick: Callable[[], None]) -> Written:
+        for each in self.trajectories:
+            name, arrays, fixed = group_name(each.source.number), each.layout.arrays, _fixed(each)
+            streams = {
+                array: (frame for block in each.blocks("position" if array == POSITION else array) for frame in block)
+                for array in arrays
+                if array not in fixed
+            }
+            times = zip(each.times.tolist(), each.frames, strict=True)
+            listed = [(time, 0, f"{name}_{frame:06d}.vtu") for time, frame in times]
+            for *_, file in listed:
+                own = fixed | {array: next(stream) for array, stream in streams.items()}
+                write_vtu(directory / file, {array: layout.pad(own[array]) for array, layout in arrays.items()})
+            (directory / f"{name}.pvd").write_text(pvd_text(listed), encoding="utf-8", newline="\n")
+            tick()
+        return {}, []
 
 
 def write_npz(path: Path, arrays: Iterable[tuple[str, np.ndarray]]) -> None:
@@ -427,4 +460,10 @@ class _Pickler(pickle.Pickler):
         return (np.ndarray, ((0,), "b"), obj.__reduce__()[2]) if isinstance(obj, np.ndarray) else NotImplemented
 
 
-FORMATS: dict[str, type[Format]] = {"lagrangebench": LagrangeBench, "gns": Gns, "npz": Npz, "vtkhdf": Vtkhdf}
+FORMATS: dict[str, type[Format]] = {
+    "lagrangebench": LagrangeBench,
+    "gns": Gns,
+    "npz": Npz,
+    "vtkhdf": Vtkhdf,
+    "vtk": Vtk,
+}

@@ -12,7 +12,7 @@ from mpmcli.output.checksums import SUMS, path_digest, sums_text
 from mpmcli.output.collider_files import MOVING_FRAME, RESTING_PIECE, as_they_moved, pvd_text, write_collider_series
 from mpmcli.output.collider_files import SERIES as COLLIDERS
 from mpmcli.output.durable import is_full, require_free_space, sealed, write_text
-from mpmcli.output.layout import PACKED, POSITION, ledger_csv
+from mpmcli.output.layout import PACKED, POSITION, FrameLayout, ledger_csv
 from mpmcli.output.result import open_result
 from mpmcli.scene.colliders import Collider
 
@@ -26,6 +26,12 @@ _CELL_BYTES, _FILE_BYTES = 24, 64 * 1024
 def is_series_file(name: str) -> bool:
     """Return whether a name is that of a file of a series."""
     return name in SERIES_FILES or bool(SERIES_FRAME.fullmatch(name) or MOVING_FRAME.fullmatch(name))
+
+
+def series_size(layout: FrameLayout, counts: Sequence[int]) -> int:
+    """Return a bound on the bytes of the files of frames with `counts` particles, not compressed."""
+    # Base64 makes 4 bytes of 3.
+    return sum(counts) * ((layout.bytes_per_particle + _CELL_BYTES) * 4 // 3) + _FILE_BYTES * len(counts)
 
 
 def write_series(
@@ -43,17 +49,14 @@ def write_series(
     result = open_result(directory / PACKED)
     index = result.index
     counts, kept = index.counts.tolist(), f"the frames are kept in {PACKED}"
-    # Base64 makes 4 bytes of 3.
-    each = (index.layout.bytes_per_particle + _CELL_BYTES) * 4 // 3
-    size = sum(counts) * each + _FILE_BYTES * len(counts)
     try:
-        require_free_space(directory, size, "the series of VTK files", kept, several=True)
+        require_free_space(directory, series_size(index.layout, counts), "the series of VTK files", kept, several=True)
         names = [f"particles_{number:06d}.vtu" for number in index.frames.tolist()]
         for k, name in enumerate(names):
             if stop():
                 raise KeyboardInterrupt
             with sealed(directory / name) as temporary:
-                _write_vtu(temporary, result.stored(k), compress=compress)
+                write_vtu(temporary, result.stored(k), compress=compress)
         columns = zip(*(table.tolist() for table in (index.frames, index.steps, index.counts)), strict=True)
         write_text(directory / SERIES_LEDGER, ledger_csv(index.ledger, list(columns)))
         times, moved = index.times.tolist(), as_they_moved(colliders, index)
@@ -79,7 +82,8 @@ def remove_series(directory: Path) -> None:
             path.unlink(missing_ok=True)
 
 
-def _write_vtu(path: Path, arrays: dict[str, np.ndarray], *, compress: bool) -> None:
+def write_vtu(path: Path, arrays: dict[str, np.ndarray], *, compress: bool = False) -> None:
+    """Write the arrays of a frame, in the form in the file, as points."""
     from meshio import Mesh, vtu
 
     points = arrays.pop(POSITION)
