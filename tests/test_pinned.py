@@ -6,6 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from good_scene import refusal
+from scipy.optimize import brentq
 from solver_state import bodies_of, scene_of
 
 from mpmcli.frames.frame import Frame
@@ -106,6 +107,59 @@ def test_what_holds_takes_what_the_body_lacks(backend_of: Callable) -> None:
     moved = frame.position - start.position
     inside = start.position[:, 0] < 0.55 - 2 * H
     assert np.abs(moved[inside] - [0.04, 0.0]).max() < 1e-12 and moved[:, 1].min() < -0.01
+
+
+def gripped(first: dict, second: dict) -> Scene:
+    """Return a bar of 16 x 4 cells on the grid of its state at rest, with a clamp at each end, 11 cells apart.
+
+    Their faces are half a cell from nodes: what is held then ends at the faces, and elsewhere up to half a cell off.
+    """
+    ends = ({"min": [0.3, 0.3], "max": [0.7251, 0.9]}, {"min": [1.2749, 0.3], "max": [1.8, 0.9]})
+    return scene_of(
+        domain={"size": [2.0, 1.2], "spacing": H},
+        time={"end": 1.0, "frames": 4},
+        bodies=[
+            {
+                "name": "bar",
+                "material": {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 2e4, "poissons_ratio": 0.3},
+                "shape": {"box": {"min": [0.6, 0.5], "max": [1.4, 0.7]}},
+            }
+        ],
+        colliders=[
+            {"name": f"clamp {k}", "wall": "hold", "shape": {"box": box}, **more}
+            for k, (box, more) in enumerate(zip(ends, (first, second), strict=True))
+        ],
+        solver={"precision": "f64", "solids": "total"},
+    )
+
+
+def test_a_bar_of_total_solids_is_pulled_to_twice_its_length(backend_of: Callable) -> None:
+    """P = mu (F - F^-T) + lambda ln J F^-T, free across: its force to a fifth of a cell in 11."""
+    pull = "0.275 * (t - sin(2*pi*t) / (2*pi))"
+    one, other = ({"axes": ["x"], "offset": [f"{sign}{pull}", "0.0"]} for sign in ("-", ""))
+    start, frame, rows = run(gripped(one, other), backend_of)
+    mu, lame = 2e4 / 2.6, 2e4 * 0.3 / (1.3 * 0.4)
+    stretch = 2.0
+    across = brentq(lambda b: mu * (b - 1 / b) + lame * np.log(stretch * b) / b, 0.2, 1.0)
+    force = 0.2 * (mu * (stretch - 1 / stretch) + lame * np.log(stretch * across) / stretch)
+    left, right = (row[0] for row in rows[-1].collider_force)
+    assert (left - right) / 2 == pytest.approx(force, rel=0.02)
+    free = np.abs(start.position[:, 0] - 1.0) < 0.2
+    assert np.diff([frame.position[free, 0].min(), frame.position[free, 0].max()]) == pytest.approx(
+        2 * np.ptp(start.position[free, 0]), rel=0.05
+    )
+
+
+def test_a_bar_of_total_solids_turns_with_its_clamps(backend_of: Callable) -> None:
+    """By a right angle: both ends as a rigid body, and the middle nearly, without a change of its volume."""
+    turn = {"pivot": [1.0, 0.6], "angular_velocity": "pi/2 * (1 - cos(2*pi*t))"}
+    start, frame, rows = run(gripped(turn, turn), backend_of)
+    away = start.position - [1.0, 0.6]
+    turned = np.stack([1.0 - away[:, 1], 0.6 + away[:, 0]], axis=1)
+    held = np.abs(start.position[:, 0] - 1.0) > 0.25 + 2 * H
+    assert frame.position[held] == pytest.approx(turned[held], abs=1e-9)
+    assert frame.position == pytest.approx(turned, abs=0.2 * H)
+    assert rows[-1].volume_ratio_min == pytest.approx(1.0, abs=0.02)
 
 
 def test_it_moves_along_a_path_and_lets_go_of_axes(backend_of: Callable) -> None:

@@ -130,5 +130,5 @@ def test_a_device_without_double_precision_moves_no_collider() -> None:
 def test_colliders_need_names_of_their_own_and_solids_that_know_them() -> None:
     with pytest.raises(InputError, match=r'colliders\[1\]\.name: "one" is the name of colliders\[0\] already'):
         scene({"name": "one"}, {"name": "one"})
-    with pytest.raises(InputError, match='"total" supports walls only'):
+    with pytest.raises(InputError, match='"total" supports walls and colliders that hold'):
         scene({}, solver={"solids": "total"})

@@ -128,6 +128,7 @@ class Colliders:
         loads: loads of the material on each collider, about its pivot.
         layered: whether some bodies touch separating colliders by their surfaces; then these colliders act here only
             if `own`, a number or a variable of a kernel, is 0.
+        at_rest: whether nodes are places of material at rest: colliders, which all hold, act where they were at time 0.
         deterministic: whether the nodes of a row are summed in order; then `given` is the impulse of each node on each
             collider in a step, N s, else None.
     """
@@ -141,13 +142,14 @@ class Colliders:
         runs: int,
         *,
         on_cpu: bool,
+        at_rest: bool = False,
         deterministic: bool = False,
     ) -> None:
         """Allocate colliders on a grid with `shape` nodes per axis, whose node `first` is the lower corner."""
         d, n = dimension, runs * kind.count
         self.kind, self.dimension, self.shape, self.first, self.on_cpu = kind, d, tuple(shape), first, on_cpu
         self.capacity, self.run, self.spacing = kind.count, 0, 0.0
-        self.layered, self.own = False, 0
+        self.layered, self.own, self.at_rest = False, 0, at_rest
         self.real = np.float64 if ti.lang.impl.current_cfg().default_fp == ti.f64 else np.float32
         self.loads = Loads(kind.count, shape, runs, on_cpu=on_cpu)
         self.distances = tuple((code, DISTANCES[FORMS[code]](d)) for code in kind.forms if code != GRID)
@@ -168,12 +170,15 @@ class Colliders:
         self.place = ti.Vector.field(d, float, shape=n)
         self.turned = ti.Matrix.field(d, d, float, shape=n)
         self.reach = ti.Matrix.field(2, d, float, shape=n)
+        # Rotation since time 0, if it is not that of `turned`.
+        self.carried = ti.Matrix.field(d, d, float, shape=n) if at_rest else None
         # Velocity of the pivot, m/s, and (R' - I) / dt, R' the rotation in a step, 1/s.
         self.velocity = ti.Vector.field(d, float, shape=n)
         self.turning = ti.Matrix.field(d, d, float, shape=n)
         self.count, self._counts = ti.field(int, shape=runs), [0] * runs
         fields = [self.form, self.wall, self.begin, self.side, self.friction, self.lets, self.place, self.turned]
         fields += [self.reach, self.velocity, self.turning] + ([self.sample] if self.grids else [])
+        fields += [self.carried] if at_rest else []
         self._rows, self._count = Rows(*fields), Rows(self.count)
         self.deterministic = deterministic
         self.given = ti.Vector.field(d, float, shape=n * math.prod(shape)) if deterministic else None
@@ -193,7 +198,7 @@ class Colliders:
             side = -1 if collider.side == "inside" else 1
             row = [form_code(collider), WALLS[collider.wall], used, side, collider.friction, held]
             row += [place - origin, turned, reach_of(collider, h), still[0], still]
-            rows.append(row + [sampled] * self.grids)
+            rows.append(row + [sampled] * self.grids + [np.eye(self.dimension)] * self.at_rest)
             used += len(numbers)
             if form_code(collider) == GRID:
                 values = samples_of(collider.form, h)[0].ravel()
@@ -239,7 +244,7 @@ class Colliders:
                 for n in range(nodes):
                     x[ti.static(d - 1)] = ti.cast(n - self.first, float) * self.spacing
                     given = (nodes_before + first + n) * self.capacity + k
-                    total += self.loads.of(self.given[given], x - self.place[i])
+                    total += self.loads.of(self.given[given], self.arm_now(i, x - self.place[i]))
                     for a in ti.static(range(d)):
                         self.given[given][a] = 0.0
                 row = self.run * self.loads.rows * self.capacity + q
@@ -262,16 +267,25 @@ class Colliders:
                 for face in range(self.faces_of(i)):
                     phi, normal = self.distance(i, arm, face)
                     if phi <= self.reach_of_surface(i):
-                        after, _grip = self.met(i, arm, normal, result)
+                        now = self.arm_now(i, arm)
+                        after, _grip = self.met(i, now, normal, result)
                         if ti.static(self.deterministic):
                             row = self.run * self.loads.rows + self.loads.row_of(node)
                             place = (row * ti.static(self.shape[-1]) + node[d - 1]) * self.capacity + k
                             for a in ti.static(range(d)):
                                 self.given[place][a] = self.given[place][a] + mass * (result[a] - after[a])
                         else:
-                            self.loads.take(self.run, node, k, mass * (result - after), arm)
+                            self.loads.take(self.run, node, k, mass * (result - after), now)
                         for a in ti.static(range(d)):
                             result[a] = after[a]
+        return result
+
+    @ti.func
+    def arm_now(self, i: int, arm: ti.template()):
+        """Return the arm of a node of collider i, m, about its pivot where it is now."""
+        result = arm
+        if ti.static(self.at_rest):
+            result = self.carried[i] @ arm
         return result
 
     @ti.func
@@ -412,13 +426,18 @@ class ColliderMotion:
             angle, change = self.pose[row, d], dt * self.rates[row, d]
             turned, turning = self.rotation(row, angle), self.rotation(row, change)
             for a in ti.static(range(d)):
-                self.colliders.place[i][a] = ti.cast(self.pose[row, a], float)
+                if ti.static(not self.colliders.at_rest):
+                    self.colliders.place[i][a] = ti.cast(self.pose[row, a], float)
                 self.colliders.velocity[i][a] = ti.cast(self.rates[row, a], float)
                 self.pose[row, a] = self.pose[row, a] + dt * self.rates[row, a]
                 for b in ti.static(range(d)):
                     own = 1.0 if ti.static(a == b) else 0.0
-                    self.colliders.turned[i][a, b] = own + turned[a, b]
+                    if ti.static(not self.colliders.at_rest):
+                        self.colliders.turned[i][a, b] = own + turned[a, b]
                     self.colliders.turning[i][a, b] = turning[a, b] / ti.cast(dt, float)
+            if ti.static(self.colliders.at_rest):
+                now = ti.Matrix.identity(float, d) + turned
+                self.colliders.carried[i] = now @ self.colliders.turned[i].transpose()
             self.pose[row, d] = angle + change
 
     @ti.func

@@ -176,7 +176,7 @@ def _pulled(facts: SceneFacts) -> Iterator[Finding]:
     """Yield the distances to which colliders that hold two parts of an elastic body will pull its particles apart."""
     scene, d = facts.scene, facts.scene.dimension
     grips = [collider for collider in scene.colliders if collider.wall == "hold" and not collider.free]
-    if not any(collider.driven for collider in grips):
+    if not any(collider.driven for collider in grips) or scene.solver.solids == "total":
         return
     for body in facts.bodies:
         if not body.law.coherent or body.law.projects or body.law.deformation == "J":

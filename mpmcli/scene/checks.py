@@ -146,8 +146,8 @@ def gravity_problems(scene: Scene) -> Iterator[Problem]:
 
 def collider_problems(scene: Scene) -> Iterator[Problem]:
     """Find colliders that share a name, overlap bodies, lie outside the domain, or jump."""
-    if scene.colliders and scene.solver.solids == "total":
-        said = '"total" supports walls only, and the scene has colliders: give solids = "updated"'
+    if scene.solver.solids == "total" and not all(collider.holds for collider in scene.colliders):
+        said = '"total" supports walls and colliders that hold, and the scene has others: give solids = "updated"'
         yield Problem(("solver", "solids"), said)
     first: dict[str, int] = {}
     placed = True

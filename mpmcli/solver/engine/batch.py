@@ -137,7 +137,8 @@ class Batch:
         if kind.layers.separate:
             surfaces = BodyContact(groups, orders, grid, kind.layers, runs, backend.threads, on_cpu=on_cpu)
         if kind.colliders.count:
-            colliders = Colliders(kind.colliders, d, grid.shape, PAD, runs, on_cpu=on_cpu, deterministic=deterministic)
+            how = {"on_cpu": on_cpu, "at_rest": kind.settings.solids == "total", "deterministic": deterministic}
+            colliders = Colliders(kind.colliders, d, grid.shape, PAD, runs, **how)
             colliders.layered, colliders.own = kind.layers.separate, int(not kind.layers.shares)
             motion = ColliderMotion(colliders, runs) if kind.colliders.moving else None
             if kind.colliders.free:
