@@ -107,7 +107,8 @@ def test_moments_are_those_of_the_form() -> None:
         ({"joint": {"type": "hinge", "axis": [0, 0, 1]}}, "axis: is for 3D scenes and this one is 2D"),
         ({"joint": {"type": "hinge", "strength": 2.0}}, 'strength: is that of a motor; give "motor" as well'),
         ({"joint": {"type": "slider"}}, "axis: missing"),
-        ({"joint": {"type": "weld"}}, "colliders[0].joint"),
+        ({"joint": {"type": "weld"}}, 'colliders[0].joint.type: must be "hinge" or "slider"; found "weld"'),
+        ({"joint": {"point": [0.7, 0.5]}}, 'colliders[0].joint: missing key: type, "hinge" or "slider"'),
         ({"restitution": 1.5}, "colliders[0].restitution: must be"),
     ],
 )

@@ -87,7 +87,8 @@ class TrajectoryCells(Result):
             for body in header.bodies:
                 name = appearance_of(body.material.get("law", "material"), dict(body.material)).name
                 material = alike.setdefault(name, body.material)
-                bodies.append(_Body(body.name, material, body.volume, body.particles_per_cell * finer, body.density))
+                own = {"particles_per_cell": body.particles_per_cell * finer, "own_density": body.density}
+                bodies.append(_Body(body.name, material, body.volume, **own))
         self.header = replace(
             first,
             # A change of this value causes pictures to be drawn again.

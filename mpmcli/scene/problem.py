@@ -182,6 +182,13 @@ def _problem(path: Path, errors: list[Any], model: type[BaseModel]) -> Problem:
             words, bound = ("at least", ctx["min_length"]) if kind == "too_short" else ("at most", ctx["max_length"])
             entries = "entry" if bound == 1 else "entries"
             return Problem(path, f"needs {words} {bound} {entries}; found {ctx['actual_length']}")
+        case "union_tag_not_found":
+            key = ctx["discriminator"].strip("'")
+            tags = [tag for table in _tables_at(model, path) for tag in get_args(table.model_fields[key].annotation)]
+            return Problem(path, f"missing key: {key}, {listed(quoted(tags))}")
+        case "union_tag_invalid":
+            known = ctx["expected_tags"].replace("'", '"').replace(", ", " or ")
+            return Problem((*path, ctx["discriminator"].strip("'")), f"must be {known}; found {written(ctx['tag'])}")
     return Problem(path, _wrong_value(errors, value))
 
 
