@@ -4,6 +4,7 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import meshio
 import numpy as np
@@ -121,6 +122,7 @@ class FakeRun:
         self.particle_count, self.step_count, self.time = 1, 0, 0.0
         self.first_step_seconds = self.frame_seconds = self.measure_seconds = 0.0
         self.laws = ("fluid",)
+        self.batch = SimpleNamespace(launch_cpu=SimpleNamespace(is_there=lambda: False))
 
     def frames(self, stop):
         for k in range(3):

@@ -111,7 +111,7 @@ def go_on(run: Run, resumption: Resumption, backend: Backend, *, forced: bool) -
 def require_same_run(resumption: Resumption, header: Mapping[str, Any], directory: Path) -> None:
     """Raise an InputError if the header differs from that of the stored frames, which prevents packing."""
     before = {} if resumption.index is None else resumption.index.header
-    for key in (key for key in header if before and key != "scene"):
+    for key in (key for key in header if before and key not in ("scene", "chosen")):
         if before.get(key) != header[key]:
             raise InputError(
                 f"{directory} holds frames whose {key} is {_text(before.get(key))}, and new ones would have "
