@@ -141,6 +141,20 @@ def test_energy_from_nowhere_is_found(run, checked, share, severity):
     assert finding.value == pytest.approx(share * turned / grown, rel=1e-3)
 
 
+def test_a_start_under_stress_is_named_as_a_cause(run):
+    """Of energy that grows; a finding of another rule keeps its advice."""
+    grown = run.with_row(K, elastic=1e6, courant_max=0.6)
+    scene = run.header["scene"].replace("[[bodies]]", '[[bodies]]\ndeformation = "0.97"', 1)
+    assert scene != run.header["scene"]
+    plain, stressed = (
+        check_kept(RunHeader.read(run.header | {"scene": text}), run.frames, grown)
+        for text in (run.header["scene"], scene)
+    )
+    assert the(plain, "energy").fix.startswith("Halve time.safety; ")
+    assert 'start with a "deformation"' in the(stressed, "energy").fix
+    assert the(stressed, "courant") == the(plain, "courant")
+
+
 @pytest.mark.parametrize(
     ("name", "value", "rule", "severity"),
     [
