@@ -23,7 +23,7 @@ SOURCES = sorted([*MODULES, *(ROOT / "tests").rglob("*.py")])
 # Imports run downwards only, or within a level.
 LEVELS = {
     **dict.fromkeys(("cli", "__main__"), 8),
-    **dict.fromkeys(("dataset", "validation", "render", "plot", "bench", "doctor"), 7),
+    **dict.fromkeys(("dataset", "validation", "render", "plot", "bench", "doctor", "error_bars"), 7),
     "simulation": 6,
     "check": 5,
     **dict.fromkeys(("solver", "output"), 4),

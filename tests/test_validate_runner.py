@@ -138,7 +138,7 @@ def test_the_key_tells_scenes_settings_and_programs_apart(monkeypatch: pytest.Mo
     monkeypatch.setattr("mpmcli.validation.cases.bar.SPEED", 0.02)
     keys.add(run_key(BAR_RUN))
     monkeypatch.undo()
-    monkeypatch.setattr("mpmcli.validation.runs._program", lambda: ("changed",))
+    monkeypatch.setattr("mpmcli.validation.runs.program", lambda: ("changed",))
     keys.add(run_key(BAR_RUN))
     assert len(keys) == 5
 

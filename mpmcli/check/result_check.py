@@ -137,19 +137,25 @@ def check_result(path: Path, stop: Callable[[], bool] = lambda: False) -> Result
     return check
 
 
-def check_kept(header: RunHeader, frames: Sequence[Frame], ledger: Sequence[LedgerRow]) -> ResultCheck:
-    """Check all frames of a finished run in memory, as `check_result` does for files, but without checksums."""
-    entries = [
-        Entry(frame.index, frame.time, row, len(frame.body), lambda frame=frame: frame)
-        for frame, row in zip(frames, ledger, strict=True)
-    ]
+def check_kept(header: RunHeader, frames: Sequence[Frame] | None, ledger: Sequence[LedgerRow]) -> ResultCheck:
+    """Check all frames of a finished run in memory, as `check_result` does for files, but without checksums.
+
+    If the frames were not kept, None, only the ledger is checked.
+    """
+    if frames is None:
+        entries = [Entry(k, row.time, row, 0, None) for k, row in enumerate(ledger)]
+    else:
+        entries = [
+            Entry(frame.index, frame.time, row, len(frame.body), lambda frame=frame: frame)
+            for frame, row in zip(frames, ledger, strict=True)
+        ]
     return _check(OpenedResult(Path(), "memory", header, {"status": "finished"}, entries), FrameFindings())
 
 
 def _check(opened: OpenedResult, findings: FrameFindings, stop: Callable[[], bool] = lambda: False) -> ResultCheck:
     check_order(opened, findings)
     figures = check_ledger(opened.entries, opened.header, findings)
-    if opened.entries:
+    if opened.entries and opened.entries[0].read is not None:
         figures |= _check_frames(opened, findings, stop)
     found = findings.found()
     if any(body.deformation is not None for body in opened.header.scene.bodies):

@@ -44,8 +44,8 @@ class Entry:
     time: float
     row: LedgerRow
     count: int
-    # Reads the frame; InputError: it is damaged.
-    read: Callable[[], Frame]
+    # Reads the frame; InputError: it is damaged. None if it is not kept.
+    read: Callable[[], Frame] | None
 
 
 @dataclass(frozen=True)

@@ -136,9 +136,12 @@ def _scene_facts(path: Path, overrides: tuple[str, ...], plugins: tuple[Path, ..
 
 
 def _result_facts(path: Path) -> dict:
+    from mpmcli.error_bars.bars import read_bars
     from mpmcli.output import open_result
 
     result = open_result(path)
+    found = read_bars(result.path, result.times)
+    headline, bars = (None, None) if found is None else found
     header, record, ledger = result.header, result.record or {}, result.ledger
     return {
         "title": header.title,
@@ -165,6 +168,8 @@ def _result_facts(path: Path) -> dict:
         "energy_J": [ledger[0].energy, ledger[-1].energy],
         "mass_kg": ledger[-1].mass,
         "volume_ratio": [min(row.volume_ratio_min for row in ledger), max(row.volume_ratio_max for row in ledger)],
+        "headline": headline,
+        "error_bars": None if bars is None else {name: one.text(-1) for name, one in bars.of.items()},
         "timings_s": record.get("timings", {}),
         "failure": (record.get("failure") or {}).get("message"),
         "version": header.version,

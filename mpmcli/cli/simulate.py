@@ -3,16 +3,22 @@
 import shlex
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from mpmcli.cli import options
+from mpmcli.cli.error_bars import plan_for, study_result
 from mpmcli.cli.interrupt import interrupt_came, interrupted_code, interrupts_wait
 from mpmcli.cli.options import COUNT, SCENE, json_option, quiet_option
 from mpmcli.cli.streams import print_answer, print_error, print_json, print_note, print_text
 from mpmcli.cli.supervisor import announce
-from mpmcli.errors import InputError
+from mpmcli.errors import InputError, RunError
+
+if TYPE_CHECKING:
+    from mpmcli.error_bars.study import Plan
+    from mpmcli.scene import LoadedScene
+    from mpmcli.simulation.summary import RunSummary
 
 
 @click.command("simulate", epilog="Example: mpmcli simulate drop.toml -o results/drop --set time.end=2")
@@ -39,6 +45,7 @@ from mpmcli.errors import InputError
 @click.option(
     "--force", is_flag=True, help="Run although `mpmcli check` finds errors, and take time.step above the stable step."
 )
+@click.option("--error-bars", is_flag=True, help="Then compute it on two coarser grids: how wrong is it?")
 @options.time_option("End the run, with the result packed, before this wall time: 2h, 90m, 45s, 1h30m or 1:30:00.")
 @click.option(
     "--max-memory",
@@ -48,13 +55,16 @@ from mpmcli.errors import InputError
 )
 @quiet_option
 @json_option
-def simulate_command(scene: Path, precision: str | None, quiet: bool, as_json: bool, **run: Any) -> int:
+def simulate_command(
+    scene: Path, precision: str | None, quiet: bool, as_json: bool, error_bars: bool, **run: Any
+) -> int:
     """Run SCENE and store its particles for ParaView, h5py and training code.
 
     SCENE is a TOML file, or the name of an example, which `mpmcli new` lists.
     """
     from mpmcli.cli.progress import SimulateProgress
     from mpmcli.materials.registry import load_plugins
+    from mpmcli.output.directory import ERROR_BARS
     from mpmcli.scene import load_scene
     from mpmcli.simulation.settings import Limits
     from mpmcli.simulation.simulate import RunSettings, simulate
@@ -68,6 +78,8 @@ def simulate_command(scene: Path, precision: str | None, quiet: bool, as_json: b
     limits = Limits(run.pop("max_time"), run.pop("max_memory"))
     run["directory"] = run["directory"] or Path("results") / scene.stem
     settings = RunSettings(**run, limits=limits, command=["mpmcli", *sys.argv[1:]])
+    wants_bars = error_bars or loaded.scene.error_bars is not None
+    plan = plan_for(loaded, settings.directory / ERROR_BARS, run) if wants_bars else None
     announce(settings.directory, loaded.inputs)
     progress = SimulateProgress(loaded.scene.time.end, loaded.scene.time.frames + 1, quiet=quiet)
     with progress, interrupts_wait():
@@ -77,8 +89,34 @@ def simulate_command(scene: Path, precision: str | None, quiet: bool, as_json: b
     if summary.status in ("interrupted", "stopped") and summary.frames:
         again = [word for word in sys.argv[1:] if word not in ("--overwrite", "--resume")]
         print_note(f"To go on: {shlex.join(['mpmcli', *again, '--resume'])}")
-    print_answer(summary, as_json, quiet=quiet)
-    return {"finished": 0, "interrupted": interrupted_code()}.get(summary.status, 1)
+    if plan is None or summary.status != "finished":
+        print_answer(summary, as_json, quiet=quiet)
+        return {"finished": 0, "interrupted": interrupted_code()}.get(summary.status, 1)
+    return _with_bars(loaded, summary, plan, as_json, quiet)
+
+
+def _with_bars(loaded: "LoadedScene", summary: "RunSummary", plan: "Plan", as_json: bool, quiet: bool) -> int:
+    """Compute the error bars of a finished run, and print them after its summary."""
+    from mpmcli.error_bars.report import as_dict, text
+    from mpmcli.output import open_result
+
+    if not as_json:
+        print_answer(summary, as_json, quiet=quiet)
+    try:
+        study = study_result(loaded, open_result(summary.directory), plan, quiet=quiet)
+    except KeyboardInterrupt:
+        print_note(f"interrupted; the run and the siblings that are done are kept: mpmcli validate {summary.directory}")
+        return interrupted_code()
+    except RunError as error:
+        print_error(f"error: {error}")
+        if as_json:
+            print_json({**summary.as_dict(), "error_bars": None})
+        return 1
+    if as_json:
+        print_json({**summary.as_dict(), "error_bars": as_dict(study)})
+    elif not quiet:
+        print_text(text(study))
+    return 0
 
 
 @click.command("warm", epilog="Example: mpmcli warm drop.toml dam_break_2d")

@@ -9,8 +9,18 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from mpmcli.cli.error_bars import BAR_OPTIONS, bar_options, study_path
 from mpmcli.cli.interrupt import interrupt_came, interrupted_code, interrupts_wait
-from mpmcli.cli.options import COUNT, choice_option, json_option, output_option, quiet_option, thread_counts
+from mpmcli.cli.options import (
+    COUNT,
+    choice_option,
+    json_option,
+    output_option,
+    plugin_option,
+    quiet_option,
+    set_option,
+    thread_counts,
+)
 from mpmcli.cli.streams import print_json, print_text
 from mpmcli.errors import InputError
 
@@ -20,14 +30,17 @@ if TYPE_CHECKING:
     from mpmcli.validation.runs import Journal
 
 
-@click.command("validate", epilog="Example: mpmcli validate couette --levels coarse")
-@click.argument("names", nargs=-1, metavar="[CASE]...")
+@click.command("validate", epilog="Examples: mpmcli validate couette --levels coarse; mpmcli validate drop.toml")
+@click.argument("names", nargs=-1, metavar="[CASE|SCENE]...")
 @choice_option(
     "--levels level",
     ["coarse", "default", "fine"],
     "default",
     "Resolutions and settings: coarse takes minutes, default up to an hour, fine more.",
 )
+@bar_options
+@set_option
+@plugin_option
 @output_option("Directory of report.md, its figures and the results; without it nothing is written.")
 @click.option("--workers", type=COUNT, help="Number of parallel runs, one thread each; one per core by default.")
 @click.option(
@@ -43,12 +56,27 @@ if TYPE_CHECKING:
 def validate_command(
     names: tuple[str, ...], level: "Level", output: Path | None, quiet: bool, as_json: bool, **asked: Any
 ) -> int:
-    """Measure speed against error on problems with known answers.
+    """Measure speed against error on problems with known answers, or the error of any scene.
 
     Each CASE, all of them by default, is run at several resolutions and with several settings, each run in a separate
     process, and compared with its tolerances. A name may be short: bar means every case whose name begins with bar_.
     The exit code is 1 if a case is out of tolerance.
+
+    A SCENE is a TOML file, an example, or a result. It is computed again on two coarser grids and compared, and each
+    of its observables gets an error bar. For a result the report is written beside it.
     """
+    if (scene := _scene_of(names)) is not None:
+        for name, default in (("workers", None), ("timeout", 1800.0), ("listing", False), ("write_scene", False)):
+            if asked[name] != default:
+                option = {"listing": "list"}.get(name, name.replace("_", "-"))
+                raise InputError(f"--{option} is for cases, and {scene} is a scene; leave it out.")
+        if level != "default":
+            raise InputError(f"--levels is for cases; --level grids, step or all chooses the siblings of {scene}.")
+        return study_path(scene, output, {**asked, "quiet": quiet, "as_json": as_json})
+    for name in (*BAR_OPTIONS, "overrides", "plugins"):
+        if asked.pop(name):
+            option = {"bar_level": "level", "overrides": "set", "plugins": "plugin"}.get(name, name)
+            raise InputError(f"--{option} is for a scene: name one, such as drop.toml, in place of cases.")
     resume, overwrite, resolution = asked["resume"], asked["overwrite"], asked["resolution"]
     if resolution is not None and not asked["write_scene"]:
         raise InputError("--resolution is for --write-scene; --levels chooses the resolutions of a report.")
@@ -97,6 +125,26 @@ def validate_command(
         if output is not None:
             print_text(f"report: {output / 'report.md'}")
     return 0 if report.passed else 1
+
+
+def _scene_of(names: Sequence[str]) -> Path | None:
+    """Return the path of a scene or a result, None if cases are named; InputError: there are several."""
+    from mpmcli.scene.examples import examples
+    from mpmcli.validation.cases import all_cases
+
+    known = all_cases()
+    found = []
+    for name in names:
+        if name in known:
+            continue
+        path = Path(name)
+        if path.suffix or path.exists():
+            found.append(path)
+        elif name in examples() and not any(case.startswith(f"{name}_") for case in known):
+            found.append(examples()[name])
+    if found and len(names) > 1:
+        raise InputError(f"error bars are those of one scene: give {found[0]} alone.")
+    return found[0] if found else None
 
 
 def _study(

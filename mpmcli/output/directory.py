@@ -1,6 +1,7 @@
 """The output directory: creates, refuses or clears it, and closes it after a crash."""
 
 import json
+import re
 import tempfile
 from collections.abc import Collection, Sequence
 from contextlib import ExitStack, suppress
@@ -18,6 +19,8 @@ from mpmcli.output.series import is_series_file
 
 SCENE = "scene.toml"
 NAMES = (PACKED, DAMAGED, SCENE, RECORD, RESTING, MOVING)
+# The directory of error bars beside a result, and the files in it.
+ERROR_BARS, BAR_FILE = "error_bars", re.compile(r"error_bars\.json|report\.md|(bands|cost)\.svg|[0-9a-f]{16}\.npz")
 
 
 @dataclass
@@ -52,6 +55,7 @@ class TakenDirectory:
         try:
             remove_segments(self.path, spared)
             remove_numbered(self.path / CHECKPOINTS, CHECKPOINT_NAME)
+            remove_numbered(self.path / ERROR_BARS, BAR_FILE)
             # The record is removed last: while it exists, the remaining files are known to be mpmcli's.
             for path in sorted(ours, key=lambda path: path.name == RECORD):
                 path.unlink(missing_ok=True)

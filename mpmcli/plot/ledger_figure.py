@@ -1,12 +1,13 @@
 """Draws the ledger of a run: energies, momenta, time steps and their limits, volumes, speeds, and extents."""
 
 import textwrap
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from mpmcli.error_bars.bars import read_bars
 from mpmcli.errors import InputError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
@@ -53,6 +54,7 @@ class History:
     lowest: np.ndarray  # (F, B, d) m, NaN where a body has no particle; `highest` alike
     highest: np.ndarray
     notes: tuple[str, ...]  # sentences on data that the figure does not show
+    bars: Mapping[str, np.ndarray] = field(default_factory=dict)  # (T,) by observable, see `error_bars`
 
     @property
     def times(self) -> np.ndarray:
@@ -62,6 +64,7 @@ class History:
 
 def read_history(result: Result) -> History:
     """Read the history of a result. Raises InputError if a frame or the ledger is damaged."""
+    found = read_bars(result.path, result.times)
     rows = result.ledger
     if len(rows) != result.frame_count:
         raise InputError(f"{result.path} is damaged: it has {result.frame_count} frames and {len(rows)} ledger rows.")
@@ -100,6 +103,7 @@ def read_history(result: Result) -> History:
         lowest=both[:, :, 0],
         highest=both[:, :, 1],
         notes=tuple(notes),
+        bars={} if found is None else {name: one.bar for name, one in found[1].of.items()},
     )
 
 
@@ -168,9 +172,17 @@ class Panel:
         self.axes.set_ylabel(textwrap.fill(label, LABEL_WIDTH))
 
     def line(
-        self, values: np.ndarray, name: str, color: int | None, width: float = 1.4, times: np.ndarray | None = None
+        self,
+        values: np.ndarray,
+        name: str,
+        color: int | None,
+        width: float = 1.4,
+        times: np.ndarray | None = None,
+        bar: np.ndarray | None = None,
     ) -> None:
-        """Draw values at the times of the frames, or at others; NaN is a gap."""
+        """Draw values at the times of the frames, or at others, perhaps with error bars as a band; NaN is a gap."""
+        if bar is not None:
+            self.axes.fill_between(self._times, values - bar, values + bar, color=self._color(color), alpha=0.2, lw=0)
         marker = "o" if np.isfinite(values).sum() < MARKED else ""
         keywords = {"color": self._color(color), "linewidth": width, "label": self._name(name)}
         self.axes.plot(self._times if times is None else times, values, marker=marker, markersize=3.5, **keywords)
@@ -264,7 +276,7 @@ def _energy(parts: Panel, change: Panel, history: History) -> None:
     parts.title("Energy", f"{'J/m' if header.dimension == 2 else 'J'}, potential above its lowest")
     parts.line(total, "total", None, width=2.0)
     for k, (name, values) in enumerate(series.items()):
-        parts.line(values, name, k)
+        parts.line(values, name, k, bar=history.bars.get(f"energy.{name}"))
     largest = float(np.nanmax(total)) if np.isfinite(total).any() else 0.0
     work = " and ".join([*["forces"] * header.driven, *["colliders"] * header.moved])
     work = f", while {work} do work" if work else ""

@@ -316,6 +316,18 @@ class Output(Table):
     compress: Flag = Field(False, description="Compress the stored file with gzip: smaller, and slower to write.")
 
 
+class ErrorBars(Table):
+    """Error bars of `mpmcli simulate`, which it computes after the run if the scene has this table."""
+
+    level: Literal["grids", "step", "all"] = Field(
+        "grids", description="Siblings: two coarser grids; also half a step; also other placements and samples."
+    )
+    confidence: Literal[90, 95] = Field(90, description="Share of true errors that the bars are to contain, percent.")
+    observe: dict[str, str] = Field(
+        {}, description="Further observables: means over the particles of expressions of x, y, z, vx, vy, vz and t."
+    )
+
+
 class Scene(Table):
     """A complete scene in SI units: every default filled in, every key checked.
 
@@ -341,6 +353,7 @@ class Scene(Table):
     )
     contact: Contact = Field(Contact(), description="Contact between bodies. Default: they stick.")
     output: Output = Field(Output(), description="Stored fields and format.")
+    error_bars: ErrorBars | None = Field(None, description="Error bars after the run. Default: none.")
     solver: SolverSettings = Field(SolverSettings(), description="Numerical method.")
 
     @model_validator(mode="after")

@@ -19,10 +19,16 @@ from mpmcli.solver.grid.sparse_grid import wants_sparse
 from mpmcli.solver.machine.backend import Arch, Backend, Optimisation, choose_backend, start, stop_backend
 from mpmcli.solver.machine.plan import make_plan, power_of_two, require_memory
 
+# Takes a frame that is not kept.
+Observe = Callable[[Frame, LedgerRow], None]
+
 
 @dataclass(frozen=True)
 class Recording:
-    """A run with T frames and rows, fewer if it stopped, its verdict, and the reason if that is not "stable"."""
+    """A run with T frames and rows, fewer if it stopped, its verdict, and the reason if that is not "stable".
+
+    `seconds`: wall time of its steps, without the first launch of a new batch, which compiles its kernels.
+    """
 
     header: RunHeader
     frames: Sequence[Frame]
@@ -31,26 +37,32 @@ class Recording:
     particles: int
     verdict: Verdict
     reason: str
+    seconds: float = 0.0
 
 
 class Recorder:
-    """Collects the frames of a run in progress."""
+    """Collects the frames of a run in progress, or gives them to `observe`, and collects only the ledger."""
 
-    def __init__(self, run: Run, scene: Scene, backend: Backend) -> None:
+    def __init__(self, run: Run, scene: Scene, backend: Backend, observe: Observe | None = None) -> None:
         facts = {"arch": backend.arch, "threads": backend.threads, "precision": backend.precision}
         self._header = RunHeader.of(scene, scene_to_toml(scene), [laws()[name] for name in run.laws], facts)
         self._run = run
+        self._observe = observe
         self._frames: list[Frame] = []
         self._ledger: list[LedgerRow] = []
+        self._began = run.batch.seconds - run.batch.first_seconds
 
     def take(self, frame: Frame, row: LedgerRow) -> None:
         """Keep a frame."""
-        self._frames.append(frame)
+        if self._observe is None:
+            self._frames.append(frame)
+        else:
+            self._observe(frame, row)
         self._ledger.append(row)
 
     def finished(self) -> Recording:
         """Return the recording of a run that has reached its end."""
-        check = check_kept(self._header, self._frames, self._ledger)
+        check = check_kept(self._header, None if self._observe else self._frames, self._ledger)
         return self._recording(check.verdict, next((f.what for f in check.findings if f.severity != "note"), ""))
 
     def stopped(self, error: UnstableRunError) -> Recording:
@@ -60,12 +72,19 @@ class Recorder:
 
     def _recording(self, verdict: Verdict, reason: str) -> Recording:
         counts = self._run.step_count, self._run.particle_count
-        return Recording(self._header, self._frames, self._ledger, *counts, verdict, reason)
+        seconds = self._run.batch.seconds - self._run.batch.first_seconds - self._began
+        return Recording(self._header, self._frames, self._ledger, *counts, verdict, reason, seconds)
 
 
-def record(run: Run, scene: Scene, backend: Backend, stop: Callable[[], bool] = lambda: False) -> Recording:
+def record(
+    run: Run,
+    scene: Scene,
+    backend: Backend,
+    stop: Callable[[], bool] = lambda: False,
+    observe: Observe | None = None,
+) -> Recording:
     """Run a scene until it ends or stops; KeyboardInterrupt: `stop` returned True."""
-    recorder = Recorder(run, scene, backend)
+    recorder = Recorder(run, scene, backend, observe)
     try:
         for frame, row in run.frames(stop):
             recorder.take(frame, row)
@@ -94,10 +113,14 @@ class Runner:
         optimisation: Optimisation | None = None,
         *,
         most_runs: int = MOST_RUNS,
+        alike: bool = False,
     ) -> None:
-        """Choose the backend; `threads` are for many particles, and `most_runs` advance together on a GPU."""
+        """Choose the backend; `threads` are for many particles, and `most_runs` advance together on a GPU.
+
+        If scenes are `alike`, all of them use kept kernels and the threads.
+        """
         self._arch, self._threads, self._optimisation = arch, threads, optimisation
-        self._most_runs = most_runs
+        self._most_runs, self._alike = most_runs, alike
         self._backend: Backend | None = None
         self._batches: list[Batch] = []
 
@@ -108,7 +131,7 @@ class Runner:
         for scene in scenes:
             particles = sample_bodies(scene)
             backend = self._choose(scene)
-            if not backend.on_cpu or not _keeps(scene, particles, backend):
+            if not backend.on_cpu or not self._keeps(scene, particles, backend):
                 continue
             kind = CompiledKind.of(scene, particles)
             place = next((i for i, known in enumerate(kinds) if known.joined(kind) is not None), None)
@@ -119,18 +142,27 @@ class Runner:
         for kind in kinds[:MOST_KINDS]:
             self._batch_for(kind, backend)
 
-    def run(self, scene: Scene, stop: Callable[[], bool] = lambda: False) -> Recording:
-        """Run a scene until it ends or stops; InputError: it cannot be run; KeyboardInterrupt: `stop` returned True."""
-        particles = sample_bodies(scene)
+    def run(
+        self,
+        scene: Scene,
+        stop: Callable[[], bool] = lambda: False,
+        observe: Observe | None = None,
+        particles: list[BodyParticles] | None = None,
+    ) -> Recording:
+        """Run a scene until it ends or stops; InputError: it cannot be run; KeyboardInterrupt: `stop` returned True.
+
+        Frames are given to `observe` instead of being kept, if there is one; `particles` are those of the scene.
+        """
+        particles = particles or sample_bodies(scene)
         backend = self._choose(scene)
-        if _keeps(scene, particles, backend):
-            backend = replace(backend, threads=1) if backend.on_cpu else backend
+        if self._keeps(scene, particles, backend):
+            backend = replace(backend, threads=1) if backend.on_cpu and not self._alike else backend
             run = Run(self._batch_for(CompiledKind.of(scene, particles), backend), 0, scene, particles)
         else:
             require_memory(make_plan(scene, backend))
             self._restart(backend)
             run = build_run(scene, backend, particles)
-        return record(run, scene, backend, stop)
+        return record(run, scene, backend, stop, observe)
 
     def run_all(self, scenes: Sequence[Scene]) -> Iterator[tuple[int, Recording | Exception]]:
         """Yield the index of each scene with its recording or error, as they end; small ones run together on a GPU."""
@@ -144,7 +176,7 @@ class Runner:
             except MpmcliError as error:
                 yield place, error
                 continue
-            if backend.on_cpu or not _keeps(scene, particles, backend):
+            if backend.on_cpu or not self._keeps(scene, particles, backend):
                 alone.append(place)
                 continue
             sampled[place] = particles
@@ -208,10 +240,9 @@ class Runner:
         self._batches.append(Batch(wanted.padded(), backend, power_of_two(runs)))
         return self._batches[-1]
 
-
-def _keeps(scene: Scene, particles: Sequence[BodyParticles], backend: Backend) -> bool:
-    """Return whether a scene with these particles uses kernels that are kept for others."""
-    count = sum(len(body.position) for body in particles)
-    if wants_sparse(scene) and backend.on_cpu:
-        return False
-    return suits_batch(count, backend) and (count < FEW_PARTICLES or not backend.on_cpu)
+    def _keeps(self, scene: Scene, particles: Sequence[BodyParticles], backend: Backend) -> bool:
+        """Return whether a scene with these particles uses kernels that are kept for others."""
+        count = sum(len(body.position) for body in particles)
+        if wants_sparse(scene) and backend.on_cpu:
+            return False
+        return self._alike or (suits_batch(count, backend) and (count < FEW_PARTICLES or not backend.on_cpu))

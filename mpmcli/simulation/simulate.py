@@ -70,7 +70,7 @@ def simulate(
     check = check_scene(loaded, plan=plan, directory=settings.directory, threads=backend.threads)
     findings = check.findings
     if not (settings.force or passes(findings)):
-        raise InputError(_refusal(loaded.source, findings))
+        raise InputError(refusal(loaded.source, findings))
     complete = earlier is not None and earlier.complete
     run = None if complete else _build(scene, settings, plan, backend)
     if stop():
@@ -293,11 +293,11 @@ def _compute(
     report()
 
 
-def _refusal(source: str, findings: Iterable[Finding]) -> str:
-    """Return the message for a scene refused by the check, a line per error."""
+def refusal(source: str, findings: Iterable[Finding], *, forced: bool = True) -> str:
+    """Return the message for a scene refused by the check, a line per error; `forced`: whether --force is known."""
     errors = [finding for finding in findings if finding.severity == "error"]
     lines = [f"{source}: {finding.what} {finding.fix}" for finding in errors]
     # A run that does not fit into memory cannot be forced.
-    if not any(finding.rule == "memory" for finding in errors):
+    if forced and not any(finding.rule == "memory" for finding in errors):
         lines.append("--force runs it all the same.")
     return "\n".join(lines)

@@ -212,11 +212,12 @@ class Journal:
 def run_key(run: Run) -> str:
     """Return the digest of the case, n, the scene, the program and the processor, on which times depend."""
     scene = all_cases()[run.case].scene_tables(run.n, run.setting)
-    return hashlib.sha256(json.dumps([run.case, run.n, scene, *_program()]).encode()).hexdigest()
+    return hashlib.sha256(json.dumps([run.case, run.n, scene, *program()]).encode()).hexdigest()
 
 
 @cache
-def _program() -> tuple[str, ...]:
+def program() -> tuple[str, ...]:
+    """Return a digest of the sources, the version of Taichi and the processor."""
     sources = sorted(path for path in PACKAGE.rglob("*") if path.is_file() and path.suffix != ".pyc")
     digest = hashlib.sha256(b"\0".join(path.read_bytes() for path in sources)).hexdigest()
     machine = describe_machine()
