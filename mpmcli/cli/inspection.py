@@ -140,8 +140,7 @@ def _result_facts(path: Path) -> dict:
     from mpmcli.output import open_result
 
     result = open_result(path)
-    found = read_bars(result.path, result.times)
-    headline, bars = (None, None) if found is None else found
+    bars = read_bars(result.path, result.times) or {}
     header, record, ledger = result.header, result.record or {}, result.ledger
     return {
         "title": header.title,
@@ -168,8 +167,8 @@ def _result_facts(path: Path) -> dict:
         "energy_J": [ledger[0].energy, ledger[-1].energy],
         "mass_kg": ledger[-1].mass,
         "volume_ratio": [min(row.volume_ratio_min for row in ledger), max(row.volume_ratio_max for row in ledger)],
-        "headline": headline,
-        "error_bars": None if bars is None else {name: one.text(-1) for name, one in bars.of.items()},
+        "headline": bars.get("headline"),
+        "error_bars": bars.get("at_end"),
         "timings_s": record.get("timings", {}),
         "failure": (record.get("failure") or {}).get("message"),
         "version": header.version,

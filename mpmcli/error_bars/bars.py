@@ -67,7 +67,9 @@ class Bar:
         return f"{value + 0.0:.{digits}f} ± {bar:.{digits}f}"
 
     def main_cause(self, k: int) -> str:
-        """Return the causes that make a bar, the largest first."""
+        """Return the causes that make a bar, the largest first; none if it is that of rounding."""
+        if self.exact(k):
+            return ""
         parts = sorted(((float(part[k]), cause) for cause, part in self.causes.items()), reverse=True)
         return ", ".join(cause for part, cause in parts if part > NAMED * self.bar[k])
 
@@ -100,33 +102,13 @@ class Bars:
             },
         }
 
-    @staticmethod
-    def read(stored: dict[str, Any]) -> "Bars":
-        """Return what `as_dict` has written."""
 
-        def array(values: list) -> np.ndarray:
-            return np.array([math.nan if value is None else value for value in values], dtype=float)
-
-        of = {
-            name: Bar(
-                array(one["value"]),
-                array(one["bar"]),
-                {cause: array(part) for cause, part in one["causes"].items()},
-                one["size"],
-            )
-            for name, one in stored["observables"].items()
-        }
-        time, warnings = np.array(stored["time_s"]), tuple(stored["warnings"])
-        return Bars(time, of, stored["parted_s"], stored["confidence_percent"], warnings)
-
-
-def read_bars(directory: Path, times: np.ndarray) -> tuple[str, Bars] | None:
-    """Return the headline and the bars of a result in a directory, or of its file; None without bars at its times."""
+def read_bars(directory: Path, times: np.ndarray) -> dict[str, Any] | None:
+    """Return the stored study of a result in a directory, or of its file; None without bars at its times."""
     path = (directory if directory.is_dir() else directory.parent) / ERROR_BARS / BARS
     try:
         stored = json.loads(path.read_text(encoding="utf-8"))
-        bars = Bars.read(stored)
-        return (stored["headline"], bars) if np.array_equal(bars.time, times) else None
+        return stored if np.array_equal(stored["time_s"], times) else None
     except (OSError, ValueError, KeyError):
         return None
 

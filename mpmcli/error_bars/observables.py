@@ -143,7 +143,7 @@ class Observer:
         # About the origin of coordinates: the ledger's is that of the domain, which siblings move.
         gravity = np.array(self.scene.domain.gravity_at(row.time))
         found |= {"energy.kinetic": row.kinetic, "energy.elastic": row.elastic}
-        if len(self._axes) == d or not gravity.any():
+        if gravity.any() and len(self._axes) == d:
             heavy = zip(self._rigid.values(), row.rigid_pose, strict=True)
             potential = -float((mass * (x @ gravity)).sum()) - sum(m * gravity @ pose[:d] for m, pose in heavy)
             found |= {"energy.potential": potential, "energy.total": row.kinetic + row.elastic + potential}

@@ -130,7 +130,8 @@ def as_dict(study: Study) -> dict[str, Any]:
     """Return the study for JSON: bars by observable, and the runs."""
     runs = [dict(zip(RUNS, row, strict=True)) for row in cost_rows(study)]
     left = [vars(one) for one in study.left_out]
-    told = {"headline": last_line(study), "runs": runs, "left_out": left, "cost_in_runs": study.cost}
+    at_end = {name: one.text(-1) for name, one in study.bars.of.items()}
+    told = {"headline": last_line(study), "at_end": at_end, "runs": runs, "left_out": left, "cost_in_runs": study.cost}
     return finite_json({**told, **study.bars.as_dict()})
 
 

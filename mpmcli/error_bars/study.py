@@ -21,6 +21,7 @@ from mpmcli.output.durable import sealed
 from mpmcli.output.result import Result
 from mpmcli.scene import LoadedScene, Scene, parse_scene, sample_bodies
 from mpmcli.scene.expression import Expression
+from mpmcli.scene.problem import several
 from mpmcli.simulation.engine import backend_for
 from mpmcli.simulation.runner import Runner
 from mpmcli.solver.machine.backend import Arch
@@ -31,7 +32,7 @@ BROKEN = ("unstable", "escaped")
 BASE = "the scene"
 # Half the step is no sibling where frames set the step: steps that its run has more at least, as a factor.
 MORE_STEPS = 1.3
-# Particles across the thinnest side of a body on the coarsest grid below which the report says so, in cells.
+# Thickness of a body on the coarsest grid below which the report says so, cells.
 THIN = 4.0
 
 
@@ -63,6 +64,11 @@ class Study:
             found.append('Bodies stick: the bar does not contain that; contact.default = "separate" parts them.')
         if any(collider.free for collider in self.scene.colliders) and self.scene.sources:
             found.append("Rigid bodies meet material up to a cell from their surface: the bar may not contain that.")
+        coarsest = self.scene.domain.spacing * max((one.ratio for one, _ in self.runs), default=1.0)
+        boxes = {body.name: np.ptp(np.array(body.shape.form.bounds()), axis=0) for body in self.scene.bodies}
+        if thin := [name for name, size in boxes.items() if size.min() < THIN * coarsest]:
+            what = f"{several(thin)}: fewer than {THIN:g} cells thick on the coarsest grid"
+            found.append(f"{what}; bars may be too narrow.")
         if not any(sibling.cause == "grid" for sibling, _ in self.runs):
             found.append("No coarser grid was computed: the bar does not contain the error of the spacing.")
         return found
@@ -103,16 +109,16 @@ class Student:
     def __init__(self, loaded: LoadedScene, plan: Plan) -> None:
         self.plan, self.scene = plan, loaded.scene
         self._folder = Path(loaded.source).parent
-        self._tables = tables_of(loaded.scene)
-        self._map = Map.of(loaded.scene)
+        self.tables = tables_of(loaded.scene)
+        self.map = Map.of(loaded.scene)
         backend = backend_for(loaded.scene, plan.arch, plan.threads)
         self._runner = Runner(backend.arch, backend.threads, backend.optimisation, alike=True)
 
     def base_of(self, result: Result, seconds: float, steps: int) -> Series:
         """Return the series of a finished result of the scene, which took some seconds and steps."""
-        kept = _Kept(self, BASE, self._tables)
+        kept = _Kept(self, BASE, self.tables)
         if (found := kept.read()) is None:
-            observer = Observer(self.scene, sample_bodies(self.scene), self._map, self.plan.observed)
+            observer = Observer(self.scene, sample_bodies(self.scene), self.map, self.plan.observed)
             for k, row in enumerate(result.ledger):
                 observer.take(result.present_frame(k, ()), row)
             found = observer.series()
@@ -123,7 +129,7 @@ class Student:
     def base(self, stop: Callable[[], bool]) -> Series:
         """Compute the scene. Raises RunError with the reason if it is unstable."""
         self._runner.expect([self.scene])
-        return self._compute(BASE, self._tables, stop)
+        return self.compute(BASE, self.tables, stop)
 
     def study(
         self, base: Series, tell: Callable[[str, int, int], None], stop: Callable[[], bool] = lambda: False
@@ -136,7 +142,7 @@ class Student:
         """
         study = Study(self.scene, base, confidence=self.plan.confidence)
         wanted: list[tuple[Sibling, Scene]] = []
-        for one in siblings_of(self._tables, base.reach, self.plan.causes):
+        for one in siblings_of(self.tables, base.reach, self.plan.causes):
             try:
                 wanted += [(one, self._scene_of(one.tables))] if isinstance(one, Sibling) else []
                 study.left_out += [one] if isinstance(one, LeftOut) else []
@@ -148,7 +154,7 @@ class Student:
         for k, (sibling, _) in enumerate(wanted):
             tell(sibling.name, k, len(wanted))
             try:
-                series = self._compute(sibling.name, sibling.tables, stop)
+                series = self.compute(sibling.name, sibling.tables, stop)
             except MpmcliError as error:
                 study.left_out.append(LeftOut(sibling.name, sibling.cause, _first_line(error)))
                 continue
@@ -165,14 +171,14 @@ class Student:
     def _scene_of(self, tables: Mapping[str, Any]) -> Scene:
         return parse_scene(dict(tables), laws=parameter_models(), directory=self._folder).scene
 
-    def _compute(self, name: str, tables: Mapping[str, Any], stop: Callable[[], bool]) -> Series:
+    def compute(self, name: str, tables: Mapping[str, Any], stop: Callable[[], bool]) -> Series:
         """Return the series of a run, computed or kept; RunError: it is unstable."""
         kept = _Kept(self, name, tables)
         if (found := kept.read()) is not None:
             return found
         scene = self._scene_of(tables)
         particles = sample_bodies(scene)
-        observer = Observer(scene, particles, self._map, self.plan.observed)
+        observer = Observer(scene, particles, self.map, self.plan.observed)
         recording = self._runner.run(scene, stop, observer.take, particles)
         if recording.verdict in BROKEN:
             raise RunError(f"The run of {name} is {recording.verdict}: {recording.reason}")
@@ -195,7 +201,7 @@ class _Kept:
     def __init__(self, student: Student, name: str, tables: Mapping[str, Any]) -> None:
         plan = student.plan
         observed = {name: expression.text for name, expression in plan.observed.items()}
-        known = [tables, observed, sorted(known_laws()), student._map.edge, *program()]
+        known = [tables, observed, sorted(known_laws()), student.map.edge, *program()]
         key = hashlib.sha256(json.dumps(known, sort_keys=True).encode()).hexdigest()[:16]
         self._path = plan.directory and plan.directory / f"{key}.npz"
 

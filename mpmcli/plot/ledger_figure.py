@@ -64,7 +64,6 @@ class History:
 
 def read_history(result: Result) -> History:
     """Read the history of a result. Raises InputError if a frame or the ledger is damaged."""
-    found = read_bars(result.path, result.times)
     rows = result.ledger
     if len(rows) != result.frame_count:
         raise InputError(f"{result.path} is damaged: it has {result.frame_count} frames and {len(rows)} ledger rows.")
@@ -91,6 +90,7 @@ def read_history(result: Result) -> History:
     extents = [[_extent(frame, label) for label in labels] for frame in (result.present_frame(k, ()) for k in chosen)]
     both = np.array(extents).reshape(len(chosen), len(labels), 2, result.dimension)
     names = bodies if apart else (bodies[0] if len(bodies) == 1 else "all bodies",)
+    bars = (read_bars(result.path, result.times) or {}).get("observables", {})
     return History(
         title=one_line(result.header.title) or result.path.stem,
         header=result.header,
@@ -103,7 +103,7 @@ def read_history(result: Result) -> History:
         lowest=both[:, :, 0],
         highest=both[:, :, 1],
         notes=tuple(notes),
-        bars={} if found is None else {name: one.bar for name, one in found[1].of.items()},
+        bars={name: np.array(one["bar"]) for name, one in bars.items()},
     )
 
 
