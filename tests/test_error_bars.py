@@ -305,14 +305,14 @@ def test_a_target_gives_the_spacing_of_first_order() -> None:
     base = series_of(water__high__x=0.5)
     base.seconds = 10.0
     study = Study(scene, base, [(grid(2.0), series_of(water__high__x=0.54))])
-    assert report.target_text(study, "front:2%").splitlines() == [
+    assert report.target_text(study, *report.target_of("front:2%")).splitlines() == [
         "water.high.x within 0.02 m needs a spacing of 0.025 m, 2 times finer, and about 80 s:",
         "spacing = 0.025",
     ]
-    assert "out of reach" in report.target_text(study, "front:0.1%")
+    assert "out of reach" in report.target_text(study, "front", 0.001)
     for text, said in (("frnt:2%", "there is no observable"), ("front:-1%", "percent of its size")):
         with pytest.raises(InputError, match=said):
-            report.target_text(study, text)
+            report.target_text(study, *report.target_of(text))
 
 
 def test_bodies_that_stick_are_warned_of() -> None:

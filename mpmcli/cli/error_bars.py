@@ -95,8 +95,9 @@ def study_result(loaded: "LoadedScene", result: "Result", plan: "Plan", *, quiet
 
 def study_path(path: Path, output: Path | None, asked: dict[str, Any]) -> int:
     """Compute the error bars of a scene, or of a result, and print them; see `mpmcli validate`."""
-    from mpmcli.error_bars.report import as_dict, target_text, text
+    from mpmcli.error_bars.report import as_dict, target_of, target_text, text
 
+    target = None if asked["target"] is None else target_of(asked["target"])
     try:
         study, output = _study_of(path, output, asked)
     except KeyboardInterrupt:
@@ -104,14 +105,12 @@ def study_path(path: Path, output: Path | None, asked: dict[str, Any]) -> int:
             raise
         print_note("interrupted; the runs that are done are kept, and the same command with --resume goes on")
         return interrupted_code()
+    advice = None if target is None else target_text(study, *target)
     if asked["as_json"]:
-        print_json(as_dict(study))
+        print_json(as_dict(study) | ({} if advice is None else {"target": advice}))
     elif not asked["quiet"]:
-        print_text(text(study))
-        if asked["target"] is not None:
-            print_text(target_text(study, asked["target"]))
-        if output is not None:
-            print_text(f"report: {output / 'report.md'}")
+        told = [text(study), advice, output and f"report: {output / 'report.md'}"]
+        print_text("\n".join(str(each) for each in told if each))
     return 0
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mpmcli.error_bars.bars import BARS, Bar, Bars, distance
+from mpmcli.error_bars.bars import BARS, Bars, distance
 from mpmcli.error_bars.observables import DENSITY
 from mpmcli.error_bars.study import Study
 from mpmcli.errors import InputError, RunError
@@ -59,31 +59,27 @@ def last_line(study: Study) -> str:
     return f"{said} at {bars.time[-1]:.4g} s: {shown}"
 
 
-def rows_of(bars: Bars, k: int) -> list[tuple[str, ...]]:
-    """Return the rows of the table at a frame, the map of the mass first and then by their bar over their size."""
-
-    def share(one: Bar) -> float:
-        return float(one.bar[k] / one.size)
-
-    known = {name: one for name, one in bars.of.items() if np.isfinite(one.value[k])}
-    order = sorted(known, key=lambda name: (name != DENSITY, -share(known[name])))
+def rows_of(bars: Bars) -> list[tuple[str, ...]]:
+    """Return the rows of the table at the end, the map of the mass first and then by their bar over their size."""
+    known = {name: one for name, one in bars.of.items() if np.isfinite(one.value[-1])}
+    order = sorted(known, key=lambda name: (name != DENSITY, -known[name].bar[-1] / known[name].size))
     return [
         (
             "mass elsewhere" if name == DENSITY else name,
-            f"{known[name].bar[k]:.2g}" if name == DENSITY else known[name].text(k),
-            "" if known[name].exact(k) else f"{100 * share(known[name]):.2g}",
-            known[name].main_cause(k),
+            f"{known[name].bar[-1]:.2g}" if name == DENSITY else known[name].text(-1),
+            "" if known[name].exact(-1) else f"{100 * known[name].bar[-1] / known[name].size:.2g}",
+            known[name].main_cause(-1),
         )
         for name in order
     ]
 
 
-def text(study: Study, at: float | None = None) -> str:
-    """Return the report as plain text; `at`: time, s, None for the end."""
+def text(study: Study) -> str:
+    """Return the report at the end of the run as plain text."""
     bars = study.bars
-    k = -1 if at is None else int(np.argmin(np.abs(bars.time - at)))
-    lines = [f"at {bars.time[k]:.4g} s, bars for {bars.confidence} %:", text_table(HEAD, rows_of(bars, k), {0, 1, 3})]
-    return "\n".join([*lines, "", *remarks(study), last_line(study)])
+    table = text_table(HEAD, rows_of(bars), {0, 1, 3})
+    head = f"at {bars.time[-1]:.4g} s, bars for {bars.confidence} %:"
+    return "\n".join([head, table, "", *remarks(study), last_line(study)])
 
 
 def remarks(study: Study) -> list[str]:
@@ -105,25 +101,15 @@ def cost_rows(study: Study) -> list[tuple[str, ...]]:
     """
     name, bars = headline(study.scene, study.bars), study.bars
     h, base = study.scene.domain.spacing, study.base
-    means = [float(np.nanmean(bars.of[one].bar)) for one in (DENSITY, name)]
-    found = [("the scene", "", base, h, *means)]
-    for sibling, series in study.runs:
-        off = float(np.nanmean(np.abs(series.values[name] - base.values[name])))
-        found.append(
-            (sibling.name, sibling.cause, series, sibling.ratio * h, float(distance(series, base).mean()), off)
-        )
-    return [
-        (
-            label,
-            cause,
-            f"{spacing:.4g}",
-            str(run.particles),
-            str(run.steps),
-            f"{run.seconds:.3g}",
-            *map(plain_number, e),
-        )
-        for label, cause, run, spacing, *e in found
-    ]
+    found = [("the scene", "", base, h, bars.of[DENSITY].bar, bars.of[name].bar)]
+    for one, run in study.runs:
+        off = np.abs(run.values[name] - base.values[name])
+        found.append((one.name, one.cause, run, one.ratio * h, distance(run, base), off))
+    rows = []
+    for label, cause, run, spacing, *off in found:
+        means = (plain_number(float(np.nanmean(each))) for each in off)
+        rows.append((label, cause, f"{spacing:.4g}", str(run.particles), str(run.steps), f"{run.seconds:.3g}", *means))
+    return rows
 
 
 def as_dict(study: Study) -> dict[str, Any]:
@@ -135,27 +121,30 @@ def as_dict(study: Study) -> dict[str, Any]:
     return finite_json({**told, **study.bars.as_dict()})
 
 
-def target_text(study: Study, text: str) -> str:
-    """Return the spacing that keeps a target "OBSERVABLE:PERCENT%", by first order, its time, and the line to paste.
+def target_of(text: str) -> tuple[str, float]:
+    """Return the name and the share of a target "OBSERVABLE:PERCENT%"; InputError: it cannot be read."""
+    name, _, percent = (part.strip() for part in text.partition(":"))
+    try:
+        share = float(percent.rstrip("% ")) / 100
+    except ValueError:
+        share = 0.0
+    if not (name and 0 < share < math.inf):
+        raise InputError(f"--target {text}: give an observable and percent of its size, such as front:2%.")
+    return name, share
 
-    "front" is the headline. InputError: the target cannot be read, or names no observable.
+
+def target_text(study: Study, name: str, share: float) -> str:
+    """Return the spacing that keeps a target, by first order, its time, and the line to paste.
+
+    "front" is the headline. InputError: there is no such observable.
     """
-    name, _, share = (part.strip() for part in text.partition(":"))
     bars, scene = study.bars, study.scene
     name = headline(scene, bars) if name == "front" else name
     if name not in bars.of:
         guess = nearest(name, list(bars.of))
-        raise InputError(
-            f'--target: there is no observable "{name}"; '
-            + (f'did you mean "{guess}"?' if guess else f"there are front, {listed(list(bars.of), 'and')}.")
-        )
-    try:
-        wanted = float(share.rstrip("% ")) / 100 * bars.of[name].size
-    except ValueError:
-        wanted = 0.0
-    if not 0 < wanted < math.inf:
-        raise InputError(f"--target {text}: give an observable and percent of its size, such as front:2%.")
-    worst = float(np.nanmax(bars.of[name].bar))
+        hint = f'did you mean "{guess}"?' if guess else f"there are front, {listed(list(bars.of), 'and')}."
+        raise InputError(f'--target: there is no observable "{name}"; {hint}')
+    wanted, worst = share * bars.of[name].size, float(np.nanmax(bars.of[name].bar))
     finer = worst / wanted
     if finer > FINEST:
         return f"{name} is within {plain_number(worst)} now: {plain_number(wanted)} is out of reach of first order."
@@ -183,7 +172,7 @@ def write(study: Study, directory: Path) -> None:
         f"**{last_line(study)}** (bars for {bars.confidence} %, end of the run)",
         "\n".join(f"* {line}" for line in remarks(study)),
         f"![Observables and their bars over time]({BANDS})",
-        markdown_table(HEAD, rows_of(bars, -1), {0, 1, 3}),
+        markdown_table(HEAD, rows_of(bars), {0, 1, 3}),
         "## Speed against error",
         "Means over all frames of how far a run is from the scene; for the scene itself, its bar.",
         markdown_table(RUNS, cost_rows(study), {0, 1}),
