@@ -196,13 +196,15 @@ def test_a_collapsed_step_is_found(run, checked):
     assert finding.value == check.figures["step_ratio"] == pytest.approx(1e-3)
 
 
+@pytest.mark.parametrize("also", [False, True], ids=["frame alone", "ledger also"])
 @pytest.mark.parametrize(
     ("J", "severity", "word"),
     [(-0.2, "error", "has no volume left"), (0.05, "warning", "is crushed"), (20.0, "warning", "is blown up")],
 )
-def test_a_particle_of_a_wrong_volume_is_named(run, checked, J, severity, word):
+def test_a_particle_of_a_wrong_volume_is_named_once(run, checked, J, severity, word, also):
     p = run.particles - 1
-    finding = the(checked(run.with_value(K, "volume_ratio", p, J)), "volume")
+    row = {"volume_ratio_max" if J > 1 else "volume_ratio_min": J} if also else {}
+    finding = the(checked(run.with_value(K, "volume_ratio", p, J), rows=run.with_row(K, **row)), "volume")
     assert (finding.severity, finding.frame, finding.body) == (severity, K, "ball")
     assert f'particle {p} of body "ball" {word}' in finding.what
 

@@ -9,9 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mpmcli.scene.expression import bounds_of, evaluate
+from mpmcli.scene.colliders import between_keys, has_jump
+from mpmcli.scene.expression import bounds_of, derivative, evaluate
 from mpmcli.scene.expression_reader import parse
-from mpmcli.scene.quadrature import Mean, largest_of, telling_times
+from mpmcli.scene.quadrature import Mean, integral_of, largest_of, telling_times
 
 EXPRESSIONS = (
     *("t * x - x / (1.5 + t)", "t % 0.7 - x % 0.3", "x ** 3 + t ** 2 - x ** -1", "abs(t) ** x", "-t + pow(x, 0.5)"),
@@ -92,3 +93,25 @@ def test_a_root_of_the_time_that_is_left_has_a_mean(end: float, frames: int) -> 
     tree = parse("sqrt(tmax - t)", ["t"], {"tmax": ast.parse(repr(end), mode="eval").body}).tree
     mean = Mean(tree, end / frames, end)
     assert mean(0.0, end) == pytest.approx(2 / 3 * math.sqrt(end), rel=1e-7)
+
+
+def test_a_slope_with_many_jumps_has_its_integral() -> None:
+    """Of a largest line of 64, the tangents of t^2, and of a path of 400 keys: the difference of the values."""
+    places = np.linspace(0.0, 1.0, 64).round(4)
+    hull = parse(f"max({', '.join(f'{2 * a:.4f}*t - {a * a:.8f}' for a in places)})", ["t"]).tree
+    gone = evaluate(hull, {"t": 0.51}) - evaluate(hull, {"t": 0.0})
+    assert integral_of(derivative(hull, "t"), 0.0, 0.51) == pytest.approx(gone, rel=1e-6)
+    times, values = np.arange(401) / 400, np.random.default_rng(0).random(401)
+    path = between_keys(times.tolist(), values.tolist())
+    assert integral_of(path, 0.0, 1.0) == pytest.approx(values[-1] - values[0], rel=1e-12)
+
+
+def test_kinks_are_no_jumps_however_many_there_are() -> None:
+    """The largest of 63 sines bends at most; every function that jumps is found where it does."""
+    sines = ", ".join(f"sin({k}*t)" for k in range(1, 64))
+    bent = (f"max({sines})", "abs(sin(9*t)) + clamp(t, 0.2, 0.3)", "2*t", "abs(t) if t < 0.5 else t", "t % 3")
+    torn = ("floor(7*t)", "ceil(3*t)", "sign(t - 0.3)", "step(t - 0.3)", "t % 0.3", "1 if t < 0.7 else t")
+    torn += ("1/(t - 0.3)", "(t - 0.3)**-1", "pow(t - 0.3, -1)", "tan(3*t)", "atan2(t - 0.3, -1)")
+    for text in bent + torn:
+        tree = parse(text, ["t"]).tree
+        assert has_jump(tree, derivative(tree, "t"), 1.0) == (text in torn), text

@@ -13,6 +13,7 @@ from solver_state import scene_of, with_colliders
 from mpmcli.errors import InputError
 from mpmcli.materials.registry import laws
 from mpmcli.output import SegmentStore
+from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
 from mpmcli.solver.engine.run import build_run
 from mpmcli.solver.machine.backend import Backend, choose_backend, has_cuda_device, start, stop_backend
@@ -121,18 +122,22 @@ def scene_with(*materials: str, dimension: int = 2) -> Scene:
     )
 
 
+@pytest.mark.parametrize("solids", ["updated", "total"])
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_the_plan_counts_what_colliders_need(backend_of: Callable, dimension: int) -> None:
-    """The loads by rows of nodes, in double precision, and the distances of a union on its grid, in single."""
+def test_the_plan_counts_what_colliders_need(backend_of: Callable, dimension: int, solids: str) -> None:
+    """Every field, with the loads by rows of nodes in double precision, and the distances of a union on its grid."""
+    hold = {"wall": "hold"} if solids == "total" else {}
     balls = [{"ball": {"center": [x] * dimension, "radius": 0.1}} for x in (0.5, 0.6)]
-    union = {"name": "union", "shape": balls[0] | {"add": [balls[1]]}}
-    plane = {"name": "plane", "shape": {"plane": {"point": [0.7] * dimension, "normal": [-1.0] * dimension}}}
-    plain = scene_with("fluid", dimension=dimension)
-    scene, backend = with_colliders(plain, [union, plane]), backend_of("f32", 1)
+    union = {"name": "union", "shape": balls[0] | {"add": [balls[1]]}} | hold
+    box = {"name": "box", "shape": {"box": {"min": [0.7] * dimension, "max": [0.8] * dimension}}} | hold
+    plain = scene_with("solid", dimension=dimension)
+    plain = plain.model_copy(update={"solver": plain.solver.model_copy(update={"solids": solids})})
+    scene, backend = with_colliders(plain, [union, box]), backend_of("f32", 1)
     colliders = build_run(scene, backend).batch.device.colliders
-    fields = 8 * colliders.loads.taken.n * colliders.loads.taken.shape[0] + 4 * colliders.samples.shape[0]
+    own, taken = vars(colliders).values(), colliders.loads.taken
+    sizes = [4 * entry_count(field) * field.shape[0] for field in own if isinstance(field, ti.Field)]
     more = make_plan(scene, backend).device_bytes - make_plan(plain, backend).device_bytes
-    assert more == fields > 0
+    assert more == sum(sizes) + 8 * entry_count(taken) * taken.shape[0] > 0
 
 
 def test_a_scene_of_fluid_plans_nothing_of_other_laws(backend_of: Callable) -> None:

@@ -235,7 +235,7 @@ def series_bytes(scene: Scene, particles: int) -> int:
 def output_findings(facts: SceneFacts, plan: Plan, forecast: Forecast, directory: Path) -> Iterator[Finding]:
     """Yield the findings on frames, disk and memory; `directory` is where results would be written."""
     scene = facts.scene
-    if facts.interval < facts.step_at_start:
+    if facts.interval < facts.step_at_start and forecast.steps < forecast.frames:
         what = (
             f"Frames are {facts.interval:.3g} s apart, less than the stable step of {facts.step_at_start:.3g} s: every "
             "step is stored, and steps are shorter than they need be."

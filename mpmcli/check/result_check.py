@@ -154,9 +154,10 @@ def check_kept(header: RunHeader, frames: Sequence[Frame] | None, ledger: Sequen
 
 def _check(opened: OpenedResult, findings: FrameFindings, stop: Callable[[], bool] = lambda: False) -> ResultCheck:
     check_order(opened, findings)
-    figures = check_ledger(opened.entries, opened.header, findings)
-    if opened.entries and opened.entries[0].read is not None:
-        figures |= _check_frames(opened, findings, stop)
+    # Frames first: of a fault that both have, theirs names the particle.
+    kept = bool(opened.entries) and opened.entries[0].read is not None
+    figures = _check_frames(opened, findings, stop) if kept else {}
+    figures |= check_ledger(opened.entries, opened.header, findings)
     found = findings.found()
     if any(body.deformation is not None for body in opened.header.scene.bodies):
         found = tuple(replace(one, fix=STRESSED) if one.rule in RELEASED else one for one in found)
@@ -230,12 +231,14 @@ def check_ledger(entries: Sequence[Entry], header: RunHeader, findings: FrameFin
     numeric = [name for name, value in vars(rows[0]).items() if isinstance(value, Real)]
     of = {name: np.array([getattr(row, name) for row in rows]) for name in numeric}
 
-    def tell(rule: str, values: np.ndarray, bad: np.ndarray, wrong: np.ndarray | bool, what: str, fix: str) -> None:
+    def tell(
+        rule: str, values: np.ndarray, bad: np.ndarray, wrong: np.ndarray | bool, what: str, fix: str, kind: str = ""
+    ) -> None:
         """Add a finding for each row that is bad; it is an error if the row is also wrong."""
         for k in np.flatnonzero(bad).tolist():
             severity, value = "error" if (bad & wrong)[k] else "warning", float(values[k])
             said = what.format(number=numbers[k], value=value, row=rows[k])
-            findings.add(severity, rule, numbers[k], said, fix, value, kind=what)
+            findings.add(severity, rule, numbers[k], said, fix, value, kind=kind or what)
 
     # Mass that has entered or left is not counted. The median identifies a single faulty row, also the first.
     emitted = of.get("emitted_mass", np.zeros(len(rows)))
@@ -272,12 +275,12 @@ def check_ledger(entries: Sequence[Entry], header: RunHeader, findings: FrameFin
     tell("overlap", overlap, overlap > OVERLAP, False, what, STIFFER)
     low, high = of["volume_ratio_min"], of["volume_ratio_max"]
     what = "In frame {number} a particle has no volume left: the smallest J is {value:.4g}"
-    tell("volume", low, low <= 0, True, what, STIFFER)
+    tell("volume", low, low <= 0, True, what, STIFFER, "has no volume left")
     what = "In frame {number} a particle is crushed: the smallest J is {value:.4g}"
-    tell("volume", low, (low > 0) & (low < CRUSHED), False, what, STIFFER)
+    tell("volume", low, (low > 0) & (low < CRUSHED), False, what, STIFFER, "is crushed")
     coherent = bool(header.laws) and all(law.coherent for law in header.laws)
     what = "In frame {number} a particle is blown up: the largest J is {value:.4g}"
-    tell("volume", high, (high > BLOWN_UP) & coherent, False, what, STIFFER)
+    tell("volume", high, (high > BLOWN_UP) & coherent, False, what, STIFFER, "is blown up")
     stepped = of["steps"] > 0
     steps: dict[str, float | None] = dict.fromkeys(("step_min", "step_max", "step_ratio"))
     if stepped.any():

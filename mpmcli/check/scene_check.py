@@ -174,6 +174,7 @@ def _plan_text(plan: Plan) -> str:
         f"{law.law}: {law.particles:,} particles of {sum(law.fields.values()) + plan.scratch_bytes} bytes "
         f"({', '.join(law.fields)}, and {plan.scratch_bytes} bytes for the sort)"
         for law in plan.laws
+        if law.particles
     ]
     extent = ", sparse, with room for more" if plan.sparse else ""
     lines.append(f"grid: {plan.nodes:,} nodes of {plan.bytes_per_node} bytes{extent}")

@@ -175,16 +175,10 @@ def _stretched(facts: SceneFacts) -> Iterator[Finding]:
 def _pulled(facts: SceneFacts) -> Iterator[Finding]:
     """Yield the distances to which colliders that hold two parts of an elastic body will pull its particles apart."""
     scene, d = facts.scene, facts.scene.dimension
-    grips = [collider for collider in scene.colliders if collider.wall == "hold" and not collider.free]
-    if not any(collider.driven for collider in grips) or scene.solver.solids == "total":
-        return
-    for body in facts.bodies:
+    for body in facts.bodies if scene.solver.solids != "total" else ():
         if not body.law.coherent or body.law.projects or body.law.deformation == "J":
             continue
-        points = body_points(body.body)
-        parts = [(grip.motion, points[grip.form.contains(points)]) for grip in grips]
-        stretches = [pulled for pair in combinations(parts, 2) if (pulled := _pull(*pair, scene.time.end))]
-        stretch = max(stretches, default=1.0)
+        stretch = pulled_stretch(scene, body)
         cells = UNEVEN * stretch * body.body.particles_per_cell ** (-1 / d)
         if cells <= STRETCHED or stretch <= 1.0:
             continue
@@ -194,6 +188,16 @@ def _pulled(facts: SceneFacts) -> Iterator[Finding]:
         )
         fix = f"Set particles_per_cell = {math.ceil(UNEVEN * stretch / STRETCHED) ** d}, or pull it less."
         yield Finding("warning", "pulled", what, fix, cells, body.name)
+
+
+def pulled_stretch(scene: Scene, body: BodyFacts) -> float:
+    """Return the largest stretch of a body between two colliders that hold it and move, 1 without any."""
+    grips = [collider for collider in scene.colliders if collider.wall == "hold" and not collider.free]
+    if not any(collider.driven for collider in grips):
+        return 1.0
+    points = body_points(body.body)
+    parts = [(grip.motion, points[grip.form.contains(points)]) for grip in grips]
+    return max((_pull(*pair, scene.time.end) for pair in combinations(parts, 2)), default=1.0) or 1.0
 
 
 def _pull(first: tuple[Motion, np.ndarray], second: tuple[Motion, np.ndarray], end: float) -> float:

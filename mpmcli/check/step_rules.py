@@ -10,6 +10,7 @@ from mpmcli.check.finding import Finding
 from mpmcli.check.forecast import damped_step, expected_steps, steps_at, wave_loss
 from mpmcli.check.geometry import spanned_axes, touched_walls
 from mpmcli.check.material_rules import LOCKING
+from mpmcli.check.shape_rules import pulled_stretch
 from mpmcli.plain_text import plain_number
 from mpmcli.scene.bounds import body_points, highest_speed
 from mpmcli.scene.schema import USUAL_FLIP, SolverSettings
@@ -273,6 +274,8 @@ def rounding_findings(facts: SceneFacts) -> Iterator[Finding]:
         density = body.body.material.density
         weight = density * facts.bounds.gravity * body.height
         typical = weight if weight > 0 else density * facts.bounds.speed**2
+        # The stress between grips exceeds that of motion.
+        typical = max(typical, body.stiffness * (pulled_stretch(facts.scene, body) - 1))
         noise = HALF_ULP * body.stiffness
         if typical > 0 and noise > STRESS_NOISE * typical:
             what = (

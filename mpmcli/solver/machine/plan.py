@@ -377,7 +377,8 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
         bins = 2 * math.prod(bins_along(cells))
     rows = all_nodes // (tile * Grid.tile_counts(cells, tile)[-1])
     tables += Loads.bytes_needed(max(1, pairs), dimension, rows) if separate else 0
-    tables += padded_colliders(ColliderKind.of(scene)).bytes_needed(dimension, rows)
+    at_rest = scene.solver.solids == "total"
+    tables += padded_colliders(ColliderKind.of(scene)).bytes_needed(dimension, rows, real, at_rest=at_rest)
     if deterministic:
         tables += nodes * padded_colliders(ColliderKind.of(scene)).count * dimension * real
     host_bytes = host_bytes_of(scene, members, sum(counts.values()), real, on_cpu=backend.on_cpu)
