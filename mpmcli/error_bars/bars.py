@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from mpmcli.error_bars.observables import DENSITY, Series
+from mpmcli.error_bars.observables import DENSITY, QUATERNION, Series
 from mpmcli.error_bars.siblings import Sibling
 from mpmcli.output.directory import ERROR_BARS
 
@@ -164,7 +164,7 @@ def sizes_of(base: Series) -> dict[str, float]:
     force = largest(".force.")
     # With E = m v^2 / 2 a momentum is 2 E / v.
     likes = {"velocity": speed, "energy": energy, "spin": 2 * extent * energy / speed}
-    likes |= {"force": force, "torque": force * extent, "volume error": 1.0}
+    likes |= {"force": force, "torque": force * extent} | dict.fromkeys(("volume error", "angle", *QUATERNION), 1.0)
     likes |= dict.fromkeys(("low", "high", "centre", *"xyz"), extent)
     found = {DENSITY: 1.0}
     for name, q in base.values.items():

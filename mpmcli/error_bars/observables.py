@@ -18,6 +18,8 @@ from mpmcli.scene.quantity import AXES
 
 # The map of the mass, always first.
 DENSITY = "density"
+# Parts of the quaternion of a rigid body, the real part first.
+QUATERNION = ("q0", "q1", "q2", "q3")
 # Cells of the scene per cell of the map: two of the coarsest grid.
 MAP_CELLS = 4
 # Shares of the mass of a body beyond its extents on either side.
@@ -156,7 +158,7 @@ class Observer:
             found |= {f"{name}.force.{axis}": part for axis, part in zip(AXES, force, strict=False)}
             found |= {f"{name}.torque.{axis}": part for axis, part in zip(AXES[-len(torque) :], torque, strict=True)}
         for name, pose in zip(self._rigid, row.rigid_pose, strict=True):
-            parts = (*AXES[:d], *(("angle",) if d == 2 else ("q0", "q1", "q2", "q3")))
+            parts = (*AXES[:d], *(("angle",) if d == 2 else QUATERNION))
             found |= {f"{name}.{part}": value for part, value in zip(parts, pose, strict=True)}
         places = dict(zip(AXES, x.T, strict=False)) | {f"v{axis}": part for axis, part in zip(AXES, v.T, strict=False)}
         for name, expression in self.observed.items():

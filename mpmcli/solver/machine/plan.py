@@ -43,7 +43,7 @@ from mpmcli.solver.particles.sort import TileOrder
 from mpmcli.solver.transfer.kept_motion import keeps_motion
 from mpmcli.solver.transfer.redistribution import fine_nodes
 from mpmcli.solver.transfer.splines import scheme_of
-from mpmcli.solver.transfer.volume import averages_volume, needs_filling
+from mpmcli.solver.transfer.volume import needs_filling
 
 # Smallest numbers of entries and of colliders for which arrays have space.
 FEWEST, FEWEST_COLLIDERS = 1024, 4
@@ -274,7 +274,7 @@ def passes_of(members: Sequence[Law], scene: Scene, *, deterministic: bool = Fal
     layers = Layers.of(scene)
     phases = step_phases(
         members,
-        [averages_volume(scene.solver, law) for law in members],
+        [law.averages_volume(scene.solver) for law in members],
         contact=layers.shares and bool(_separating_axes(scene)),
         friction=bool(_rough_axes(scene)),
         deterministic=deterministic,
@@ -316,7 +316,7 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
     for emitter in scene.emitters:
         counts[emitter.material.law] += sheets_of(emitter, scene).particles
     members = law_objects(scene)
-    averaged = [averages_volume(scene.solver, law) for law in members]
+    averaged = [law.averages_volume(scene.solver) for law in members]
     require_contact_possible(scene, backend)
     _require_rigid_possible(scene)
     fields_of = Layers.of(scene)

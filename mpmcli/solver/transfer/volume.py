@@ -18,7 +18,6 @@ from mpmcli.materials.law import SMALLEST, Law
 from mpmcli.materials.tensors import volume_strain
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
-from mpmcli.scene.schema import SolverSettings
 from mpmcli.solver.particles.arrays import MASS, VOLUME
 from mpmcli.solver.particles.state_bounds import volume_ratio
 from mpmcli.solver.transfer.lanes import (
@@ -32,13 +31,6 @@ from mpmcli.solver.transfer.lanes import (
     zero_lanes,
 )
 from mpmcli.solver.transfer.splines import PAD, bounded
-
-
-def averages_volume(settings: SolverSettings, law: Law) -> bool:
-    """Return whether the particles of a law share their change of volume."""
-    if settings.f_bar == "auto":
-        return law.locks
-    return settings.f_bar and law.deformation == "F"
 
 
 @ti.func
