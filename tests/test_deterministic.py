@@ -241,7 +241,7 @@ def test_a_gpu_without_it_has_nothing_of_it(backend_of: Callable) -> None:
     plain, asked = (mixed(2, (JELLY,), deterministic=asked) for asked in (False, True))
     assert build_run(plain, backend).grid.fixed is None
     grid = build_run(asked, backend).grid
-    bytes_of = 8 * sum(sums.width for sums in grid.fixed.kept) - 4 * 3
+    bytes_of = 8 * sum(sums.width for sums in grid.fixed.kept) - 4 * 4
     assert make_plan(asked, backend).bytes_per_node - make_plan(plain, backend).bytes_per_node == bytes_of
     passes = make_plan(asked, backend).passes
     assert [name for name in passes if name not in make_plan(plain, backend).passes] == ["read sums in fixed point"]

@@ -12,7 +12,7 @@ from mpmcli.scene import Body, Scene, SceneBounds, highest_speed, scene_bounds
 from mpmcli.scene.bounds import body_places, body_points
 from mpmcli.scene.sampling import initial_deformation, initial_motion, moves_unevenly
 from mpmcli.stability.limits import FIX, WHY, collider_limit, deformation_limit, mode_limit, speed_limit
-from mpmcli.stability.transfer_factors import F_BAR_STEP, step_inertia
+from mpmcli.stability.transfer_factors import step_inertia
 
 # Velocity gradient of an impact, in speeds per cell: one side of a cell stops while matter enters from two nodes.
 IMPACT_GRADIENT = 2.0
@@ -119,11 +119,11 @@ def scene_limits(scene: Scene, bounds: SceneBounds, starts: Sequence[Start] | No
 def _material_limits(body: Body, law: Law, state: str, bound: StateBound, scene: Scene) -> Iterator[SceneLimit]:
     """Yield the smallest limit of each name from the modes of one body in one state."""
     density, spacing, solver = body.material.density, scene.domain.spacing, scene.solver
-    inertia, shared = step_inertia(solver), step_inertia(solver, averages=law.averages_volume(solver))
+    inertia = step_inertia(solver)
     smallest: dict[str, tuple[float, float, float]] = {}
     modes = law.reference_modes if solver.solids == "total" else law.modes
     for mode in modes(body.material, law.rebound_bound(bound)):
-        value, name = mode_limit(spacing, density, mode.stiffness, mode.viscosity, shared)
+        value, name = mode_limit(spacing, density, mode.stiffness, mode.viscosity, inertia)
         entry = (value, mode.stiffness, mode.viscosity)
         smallest[name] = min(smallest.get(name, entry), entry)
     for name, (value, stiffness, viscosity) in smallest.items():
@@ -145,8 +145,6 @@ def _material_limits(body: Body, law: Law, state: str, bound: StateBound, scene:
         if inertia != 1:
             scheme = f'transfer = "{solver.transfer}" with kernel = "{solver.kernel}"'
             why += f"; {scheme} is stable at {longer:.3g} times that step"
-        if shared != inertia:
-            why += f"; with f_bar it takes {F_BAR_STEP:g} of that step"
         meaning = _state_text(bound, "at rest" if state == "rest" else "as at rest")
         fix = f"{_capital(cure)} {allow} about twice the step."
         yield SceneLimit(value, name, body.name, state, meaning, f"{why}.", fix, bound)

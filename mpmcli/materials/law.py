@@ -10,7 +10,7 @@ import numpy as np
 
 from mpmcli.quick_taichi import ti
 from mpmcli.scene.material import Internal, MaterialParameters, SceneBounds
-from mpmcli.scene.schema import NEARLY_INCOMPRESSIBLE, SolverSettings
+from mpmcli.scene.schema import NEARLY_INCOMPRESSIBLE
 
 # In bulk the pressure itself adds stiffness, because particles carry it with them: the stiffness of pressure waves is
 # the sum of the tangent modulus and the pressure (docs/theory.md, 6.6). For a fluid of p = K (1/J - 1) that is K at any
@@ -125,12 +125,6 @@ class Law(ABC):
         self.internal: tuple[Internal, ...] = self.parameters.internal_in(dimension)
         ratios = [getattr(member, "poissons_ratio", 0.0) for member in members]
         self.locks = max(ratios, default=0.0) > NEARLY_INCOMPRESSIBLE and not self.flows
-
-    def averages_volume(self, settings: SolverSettings) -> bool:
-        """Return whether the particles of a cell share their changes of volume (docs/theory.md, 4.4)."""
-        if settings.f_bar == "auto":
-            return self.locks
-        return settings.f_bar and self.deformation == "F"
 
     @property
     def terms(self) -> tuple[tuple[str, bool], ...]:

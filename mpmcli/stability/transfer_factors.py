@@ -32,21 +32,13 @@ def affine_moment(settings: SolverSettings) -> float:
     return 1 / INVERSE_MOMENT[settings.kernel]
 
 
-# Steps of bodies whose particles share their changes of volume, over those of others (docs/theory.md, 4.4): particles
-# between two cells may change cells in every step. Of 13 balls and boxes the least stable was so up to 0.72.
-F_BAR_STEP = 0.85
-
-
-def step_inertia(settings: SolverSettings, *, averages: bool = False) -> float:
+def step_inertia(settings: SolverSettings) -> float:
     """Return the inertia that opposes a particle's stiffness, over that of APIC with quadratic splines.
-
-    `averages`: whether the particles of a cell share their changes of volume.
 
     A lone particle obeys C' = C - a tau with a = dt / (D density), tau = S e + V C and e' = e + dt C', which is stable
     while dt^2 S + 2 dt V <= 4 D density. AFLIP has the bound of APIC (docs/theory.md, 6.1).
     """
-    shared = F_BAR_STEP**2 if averages and settings.solids != "total" else 1.0
-    return shared * 4 / INVERSE_MOMENT[settings.kernel]
+    return 4 / INVERSE_MOMENT[settings.kernel]
 
 
 def loss_per_step(settings: SolverSettings, kh: float) -> float:

@@ -47,6 +47,7 @@ from mpmcli.solver.transfer.node_update import NodeUpdate
 from mpmcli.solver.transfer.particle_update import BEYOND, ParticleUpdate
 from mpmcli.solver.transfer.redistribution import FineBlocks, FineGrid
 from mpmcli.solver.transfer.splines import PAD, scheme_of
+from mpmcli.solver.transfer.volume import averages_volume
 
 # Factor from the required to the allocated blocks when a sparse grid is enlarged.
 GROWTH = 2
@@ -90,7 +91,7 @@ class Batch:
         # Many small runs on a GPU fit its cache; they are not sorted and use all nodes of their domains.
         sorts = on_cpu or runs == 1 or kind.inflow.any or kind.layers.separate
         scheme = scheme_of(kind.settings, keeps_flip_velocity=kind.keeps_motion)
-        averaged = [law.averages_volume(kind.settings) for law in kind.members]
+        averaged = [averages_volume(kind.settings, law) for law in kind.members]
         period = Period(kind.faces, runs, at_once=not on_cpu)
         deterministic = kind.settings.deterministic and not on_cpu
         grid = self._make_grid(period, room_for_blocks(sum(kind.particles)), deterministic=deterministic)
@@ -214,7 +215,7 @@ class Batch:
             self.runs,
             tile=tile,
             keeps_filling=kind.keeps_filling,
-            uses_f_bar=[law.averages_volume(kind.settings) for law in kind.members],
+            uses_f_bar=[averages_volume(kind.settings, law) for law in kind.members],
             period=period,
             opens=kind.inflow.opens,
             deterministic=deterministic,

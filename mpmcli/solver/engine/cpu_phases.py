@@ -439,7 +439,7 @@ class CpuPhases(RunPhases):
             average_pencils(at, first, after)
         elif at.region == 0 and at.part == 0:
             first, after = self.come_in(at.g, at.order, at.run)
-            average_range(at.grid, at.g, at.group, first, after)
+            average_range(at.grid, at.g, at.group, first, after, at.step.dt)
 
     @ti.func
     def scatter(self, at: ti.template()):

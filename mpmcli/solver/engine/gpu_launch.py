@@ -166,7 +166,7 @@ class GpuPhases(RunPhases):
     @ti.func
     def average(self, at: ti.template()):
         """Add a particle to the sums of its cell."""
-        add_volume(at.grid, at.g, at.group, at.q)
+        add_volume(at.grid, at.g, at.group, at.q, at.step.dt)
 
     @ti.func
     def scatter(self, at: ti.template()):
@@ -309,7 +309,7 @@ class GpuPhases(RunPhases):
         if ti.static(turn == 0):
             clear_mean(view.grid, g, view.groups[g], p)
         if ti.static(turn == 1):
-            add_volume(view.grid, g, view.groups[g], p)
+            add_volume(view.grid, g, view.groups[g], p, 0.0)
         if ti.static(turn == 2):
             view.groups[g].to_mean[p] = missing_to_mean(view.grid, g, view.groups[g], p)
 

@@ -317,9 +317,7 @@ class StepControl:
         # Without material; the energy in the ledger is then within 1 % of that turned over.
         pull = math.hypot(*scene.domain.gravity_at(0.0))
         self._none = Limit(FALL * speed_limit(self._spacing, 0.0, pull), "speed", "")
-        self._inertia = [
-            step_inertia(scene.solver, averages=group.law.averages_volume(scene.solver)) for group in groups
-        ]
+        self._inertia = step_inertia(scene.solver)
         self._measure = measurements
         state.longest = MOST_PUSHED_STEPS if scene.pushes else MOST_UNWATCHED_STEPS
         # A step of safety times the limit is stable until the stiffness has grown by the factor safety^-2.
@@ -442,7 +440,7 @@ class StepControl:
             modes = group.law.reference_modes if group.total else group.law.modes
             for mode in modes(parameters, bound):
                 value, cause = mode_limit(
-                    self._spacing, parameters.density, mode.stiffness, mode.viscosity, self._inertia[g]
+                    self._spacing, parameters.density, mode.stiffness, mode.viscosity, self._inertia
                 )
                 limits.append(Limit(value, cause, self._names[place]))
         return limits

@@ -113,7 +113,7 @@ class FixedPoint:
         sums = partial(FixedSums, count=grid.runs * grid.node_count, wide=arch in WIDE)
         self.nodes = sums(grid.width)
         self.filling = sums(grid.kept) if grid.keeps_filling else None
-        self.means = tuple(sums(3) if group.uses_f_bar else None for group in groups)
+        self.means = tuple(sums(4) if group.uses_f_bar else None for group in groups)
         wide, fine = arch in WIDE, grid.fine
         self.fine = FixedSums(1, grid.runs * fine.node_count, wide=wide) if fine else None
         self.of_fine = self.fine.scale(CROWDED) if fine else 0.0
@@ -143,7 +143,7 @@ class FixedPoint:
     @staticmethod
     def bytes_needed(numbers: int, averaged: int) -> int:
         """Return the bytes of `numbers` sums of a node and of the sums of `averaged` groups that average volumes."""
-        return 8 * (numbers + 3 * averaged)
+        return 8 * (numbers + 4 * averaged)
 
     @ti.func
     def set_step(self, run: int, step: float):
@@ -211,13 +211,12 @@ class FixedPoint:
                 grid.filling[node][d] = self.filling.value(node)[d] / self.scales[self.run][OF_VOLUME]
 
     @ti.func
-    def add_mean(self, g: ti.template(), cell: int, volume: float, log: float, growth: float):
-        """Add ln J of a particle of the g-th group, its growth, and 1, times the volume, m^3, to its cell."""
+    def add_mean(self, g: ti.template(), cell: int, first: ti.template(), volume: float, value: float):
+        """Add a value of a particle of the g-th group, and 1, times the volume, m^3, to two entries of its cell."""
         scales = self.scales[self.run]
-        more = ti.Vector([log, growth, 1.0])
-        for k in ti.static(range(2)):
-            more[k] = ti.max(ti.min(more[k], LARGEST_LOG), -LARGEST_LOG) * scales[OF_LOG]
-        more[2] = scales[OF_CELL]
+        more = ti.Vector.zero(float, 4)
+        more[first] = ti.max(ti.min(value, LARGEST_LOG), -LARGEST_LOG) * scales[OF_LOG]
+        more[ti.static(first + 1)] = scales[OF_CELL]
         self.means[g].add(cell, volume * more)
 
     @ti.func
@@ -225,6 +224,6 @@ class FixedPoint:
         """Return the entry of `Grid.means` of the g-th group for a cell."""
         value = self.means[g].value(cell)
         for k in ti.static(range(2)):
-            value[k] /= self.scales[self.run][OF_LOG]
-        value[2] /= self.scales[self.run][OF_CELL]
+            value[2 * k] /= self.scales[self.run][OF_LOG]
+            value[2 * k + 1] /= self.scales[self.run][OF_CELL]
         return value

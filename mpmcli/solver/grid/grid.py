@@ -93,9 +93,9 @@ class Grid(LinearNodes):
             that relax volumes; None if it follows from the mass.
         keeps_filling: whether `filling` is not None.
         holding: `filling` if it is not None, otherwise `nodes`.
-        means: per group, a Vector(3) field: sums over the particles in the cell whose first node is this node, of the
-            volume at rest times ln J, the volume at rest times the growth of ln J, and the volume at rest, m^3; None
-            for groups that do not average volumes (`transfer.volume`).
+        means: per group, a Vector(4) field: sums over the particles in the cell whose first node is this node, of the
+            volume at rest times ln J, and the volume at rest, m^3; and over those that were there in the last step, of
+            the volume times the growth of ln J, and the volume; None for groups that do not average volumes.
         kept_means: the entries of `means` that are not None.
         opens: (axis, side) of every open face; nodes beyond it are ordinary nodes.
         fixed: sums in fixed point, which `FixedPoint.to_float` converts to the fields; None if P2G adds to the fields
@@ -146,7 +146,7 @@ class Grid(LinearNodes):
         self.filling = ti.Vector.field(width, float, shape=count) if keeps_filling else None
         self.holding = self.filling if keeps_filling else self.nodes
         self.means = tuple(
-            ti.Vector.field(3, float, shape=count) if wanted and not deterministic else None for wanted in uses_f_bar
+            ti.Vector.field(4, float, shape=count) if wanted and not deterministic else None for wanted in uses_f_bar
         )
         self.kept_means = tuple(means for means in self.means if means is not None)
         self.period = period
@@ -192,7 +192,7 @@ class Grid(LinearNodes):
             if ti.static(self.keeps_filling):
                 self.filling[node] = ti.Vector.zero(float, self.kept)
             for means in ti.static(self.kept_means):
-                means[node] = ti.Vector.zero(float, 3)
+                means[node] = ti.Vector.zero(float, 4)
 
     @ti.func
     def part(self, index: int, first: ti.template()):

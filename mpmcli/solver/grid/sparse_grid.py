@@ -216,7 +216,7 @@ def room_for_blocks(particles: int) -> int:
 def most_blocks(grid: "SparseGrid") -> int:
     """Return the largest number of blocks of a larger grid, limited by free memory and 32-bit indices."""
     fine, free = grid.fine.in_cell if grid.fine else 0, psutil.virtual_memory().available
-    numbers = grid.width + grid.kept * grid.keeps_filling + 3 * len(grid.kept_means) + fine
+    numbers = grid.width + grid.kept * grid.keeps_filling + 4 * len(grid.kept_means) + fine
     # Bytes of a block, including the tables of a sort on some threads.
     block = (4 if grid.nodes.dtype == ti.f32 else 8) * numbers * grid.block + 4 * 16
     return int(min(MEMORY_SHARE * free // block, LARGEST_INDEX // (grid.block * max(fine, 1))))

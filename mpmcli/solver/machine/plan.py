@@ -43,7 +43,7 @@ from mpmcli.solver.particles.sort import TileOrder
 from mpmcli.solver.transfer.kept_motion import keeps_motion
 from mpmcli.solver.transfer.redistribution import fine_nodes
 from mpmcli.solver.transfer.splines import scheme_of
-from mpmcli.solver.transfer.volume import needs_filling
+from mpmcli.solver.transfer.volume import averages_volume, needs_filling
 
 # Smallest numbers of entries and of colliders for which arrays have space.
 FEWEST, FEWEST_COLLIDERS = 1024, 4
@@ -274,7 +274,7 @@ def passes_of(members: Sequence[Law], scene: Scene, *, deterministic: bool = Fal
     layers = Layers.of(scene)
     phases = step_phases(
         members,
-        [law.averages_volume(scene.solver) for law in members],
+        [averages_volume(scene.solver, law) for law in members],
         contact=layers.shares and bool(_separating_axes(scene)),
         friction=bool(_rough_axes(scene)),
         deterministic=deterministic,
@@ -316,7 +316,7 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
     for emitter in scene.emitters:
         counts[emitter.material.law] += sheets_of(emitter, scene).particles
     members = law_objects(scene)
-    averaged = [law.averages_volume(scene.solver) for law in members]
+    averaged = [averages_volume(scene.solver, law) for law in members]
     require_contact_possible(scene, backend)
     _require_rigid_possible(scene)
     fields_of = Layers.of(scene)
@@ -352,7 +352,7 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
         nodes = blocks * tile**dimension
     filling, deterministic = needs_filling(scene, members, layers), scene.solver.deterministic and not backend.on_cpu
     numbers = layers * width * (1 + scheme.keeps_flip_velocity + filling)
-    node_bytes = real * (numbers + layers * 3 * sum(averaged))
+    node_bytes = real * (numbers + layers * 4 * sum(averaged))
     # 0 without shifts.
     fine = fine_nodes(scene, members) ** dimension
     node_bytes += real * fine
@@ -360,7 +360,7 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
         shared = sum(averaged)
         node_bytes += FixedPoint.bytes_needed(numbers, shared) + FixedPoint.bytes_needed(1, 0) * fine
         # The fixed-point means replace the floating-point ones.
-        node_bytes -= real * 3 * shared
+        node_bytes -= real * 4 * shared
     all_tiles, bins = all_nodes // tile**dimension, 0
     tables = len(groups) * TileOrder.bytes_needed(blocks if sparse else all_tiles, backend.threads)
     if sparse:

@@ -250,7 +250,7 @@ def advance_range(
 
         for lane in range(count):
             if ti.static(group.evened):
-                missing[lane] = missing_growth(grid, g, group, begin + lane)
+                missing[lane] = missing_growth(grid, g, group, begin + lane, dt)
             w = weights_of(weights, nodes, d, lane)
             velocity, moment = gather_linear(near.nodes, near, first_node[lane], w)
             for c in ti.static(range(width)):
@@ -337,7 +337,7 @@ def average_pencils(at: ti.template(), first: int, last: int):
     for r in range(first, last):
         pencil = at.order.pencil_of(at.turn, r)
         begin, after = at.order.first_particle_of(pencil), at.order.first_particle_of(pencil + 1)
-        average_range(at.grid, at.g, at.group, begin, after)
+        average_range(at.grid, at.g, at.group, begin, after, at.step.dt)
 
 
 @ti.func

@@ -36,8 +36,7 @@ def keeps_motion(scene: Scene, members: Sequence[Law]) -> bool:
 
 def own_limit(source: Body | Emitter, law: Law, scene: Scene) -> float:
     """Return the stable step of a source of particles at the start, s."""
-    material, h = source.material, scene.domain.spacing
-    inertia = step_inertia(scene.solver, averages=law.averages_volume(scene.solver))
+    material, h, inertia = source.material, scene.domain.spacing, step_inertia(scene.solver)
     modes = law.reference_modes if scene.solver.solids == "total" else law.modes
     found = modes(material, StateBound())
     stiffness = (mode_limit(h, material.density, mode.stiffness, mode.viscosity, inertia)[0] for mode in found)

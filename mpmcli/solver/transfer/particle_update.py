@@ -156,7 +156,7 @@ class ParticleUpdate:
             for c in ti.static(range(d)):
                 remainder[c] = group.gradient[p][c, d]
         if ti.static(group.evened):
-            missing = missing_growth(grid, g, group, p)
+            missing = missing_growth(grid, g, group, p, dt)
         if ti.static(grid.scheme.keeps_flip_velocity):
             share = group.kept[group.row_number(p)]
         deformation, constants = group.deformation(p), group.constants(p)

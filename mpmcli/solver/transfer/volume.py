@@ -18,12 +18,12 @@ from mpmcli.materials.law import SMALLEST, Law
 from mpmcli.materials.tensors import volume_strain
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
+from mpmcli.scene.schema import SolverSettings
 from mpmcli.solver.particles.arrays import MASS, VOLUME
 from mpmcli.solver.particles.state_bounds import volume_ratio
 from mpmcli.solver.transfer.lanes import (
     LANES,
     load_deformation,
-    load_entry,
     load_vectors,
     matrix_of,
     repeat_first,
@@ -31,6 +31,13 @@ from mpmcli.solver.transfer.lanes import (
     zero_lanes,
 )
 from mpmcli.solver.transfer.splines import PAD, bounded
+
+
+def averages_volume(settings: SolverSettings, law: Law) -> bool:
+    """Return whether the particles of a law share their change of volume."""
+    if settings.f_bar == "auto":
+        return law.locks
+    return settings.f_bar and law.deformation == "F"
 
 
 @ti.func
@@ -62,19 +69,28 @@ def log_volume(H: ti.template()):
 
 
 @ti.func
-def average_range(grid: ti.template(), g: ti.template(), group: ti.template(), first: int, last: int):
-    """Add particles first to last - 1 of the g-th group to the sums of their cells, which no other thread may write."""
+def earlier_cell(grid: ti.template(), group: ti.template(), p: int, dt: float):
+    """Return the linear index of the first node of the cell in which particle p was a step of dt, s, ago."""
+    cell = cell_of(grid, group.x[p] - dt * group.v[p])
+    if ti.static(group.layers > 1):
+        cell += group.layer_of(p) * ti.static(grid.node_count)
+    return cell
+
+
+@ti.func
+def average_range(grid: ti.template(), g: ti.template(), group: ti.template(), first: int, last: int, dt: float):
+    """Add particles first to last - 1 of the g-th group to the sums of their cells, which no other thread may write.
+
+    Their growth is added to the cells in which they were in the last step, of dt, s.
+    """
     d = ti.static(group.dimension)
     x, deformation = zero_lanes(d), zero_lanes(ti.static(d * d))
     volumes, logs, cells = ti.Vector.zero(float, LANES), ti.Vector.zero(float, LANES), ti.Vector.zero(int, LANES)
-    growths = zero_lanes(1)
     begin = first
     while begin < last:
         count = ti.min(LANES, last - begin)
         load_deformation(group, bounded(begin), deformation)
         load_vectors(x, group.place_on_grid, bounded(begin))
-        if ti.static(group.evened):
-            load_entry(growths, 0, group.growth, (), bounded(begin))
         if count < LANES:
             repeat_first(deformation, count)
             repeat_first(x, count)
@@ -87,32 +103,40 @@ def average_range(grid: ti.template(), g: ti.template(), group: ti.template(), f
             if ti.static(group.layers > 1):
                 cells[lane] += group.layer_of(begin + ti.min(lane, count - 1)) * ti.static(grid.node_count)
         for lane in range(count):
-            group.cell[begin + lane] = cells[lane]
-            group.to_mean[begin + lane] = logs[lane]
-            share = volumes[lane] * ti.Vector([logs[lane], growths[0, lane], 1.0])
-            grid.means[g][cells[lane]] = grid.means[g][cells[lane]] + share
+            p, cell = begin + lane, cells[lane]
+            group.cell[p] = cell
+            group.to_mean[p] = logs[lane]
+            grid.means[g][cell] = grid.means[g][cell] + volumes[lane] * ti.Vector([logs[lane], 1.0, 0.0, 0.0])
+            if ti.static(group.evened):
+                before = earlier_cell(grid, group, p, dt)
+                share = volumes[lane] * ti.Vector([0.0, 0.0, group.growth[p], 1.0])
+                grid.means[g][before] = grid.means[g][before] + share
         begin += LANES
 
 
 @ti.func
-def add_volume(grid: ti.template(), g: ti.template(), group: ti.template(), p: int):
-    """Add particle p to the sums of its cell, with atomics."""
+def add_volume(grid: ti.template(), g: ti.template(), group: ti.template(), p: int, dt: float):
+    """Add particle p to the sums of its cell, and its growth to that in which it was a step of dt, s, ago; atomics."""
     H = ti.Matrix.zero(float, group.dimension, group.dimension)
     for i, j in ti.static(ti.ndrange(group.dimension, group.dimension)):
         H[i, j] = group.displacement_gradient[p][i, j]
-    own, growth = log_volume(H), 0.0
-    if ti.static(group.evened):
-        growth = group.growth[p]
+    own = log_volume(H)
     group.to_mean[p] = own
     volume, cell = group.row(p)[VOLUME], cell_of_particle(grid, group, p)
     group.cell[p] = cell
+    add_to_mean(grid, g, cell, 0, volume, own)
+    if ti.static(group.evened):
+        add_to_mean(grid, g, earlier_cell(grid, group, p, dt), 2, volume, group.growth[p])
+
+
+@ti.func
+def add_to_mean(grid: ti.template(), g: ti.template(), cell: int, first: ti.template(), volume: float, value: float):
+    """Add a value times the volume of a particle, and the volume, to two sums of a cell."""
     if ti.static(grid.deterministic):
-        grid.fixed.add_mean(g, cell, volume, own, growth)
+        grid.fixed.add_mean(g, cell, first, volume, value)
     else:
-        ti.atomic_add(grid.means[g][cell][0], volume * own)
-        if ti.static(group.evened):
-            ti.atomic_add(grid.means[g][cell][1], volume * growth)
-        ti.atomic_add(grid.means[g][cell][2], volume)
+        ti.atomic_add(grid.means[g][cell][first], volume * value)
+        ti.atomic_add(grid.means[g][cell][ti.static(first + 1)], volume)
 
 
 @ti.func
@@ -132,7 +156,7 @@ def clear_cell(grid: ti.template(), g: ti.template(), cell: int):
     if ti.static(grid.deterministic):
         grid.fixed.means[g].clear(cell)
     else:
-        grid.means[g][cell] = ti.Vector.zero(float, 3)
+        grid.means[g][cell] = ti.Vector.zero(float, 4)
 
 
 @ti.func
@@ -152,7 +176,7 @@ def sums_of_cell(grid: ti.template(), g: ti.template(), cell: int):
             image, exists = grid.period.image(grid.place_of(cell), images)
             if exists:
                 more = sums_at(grid, g, grid.linear_index(image))
-                for k in ti.static(range(3)):
+                for k in ti.static(range(4)):
                     sums[k] += more[k]
     return sums
 
@@ -161,14 +185,14 @@ def sums_of_cell(grid: ti.template(), g: ti.template(), cell: int):
 def missing_to_mean(grid: ti.template(), g: ti.template(), group: ti.template(), p: int):
     """Return the mean of ln J over the cell of particle p minus its own ln J."""
     sums = sums_of_cell(grid, g, group.cell[p])
-    return sums[0] / sums[2] - group.to_mean[p]
+    return sums[0] / sums[1] - group.to_mean[p]
 
 
 @ti.func
-def missing_growth(grid: ti.template(), g: ti.template(), group: ti.template(), p: int):
-    """Return the mean growth of ln J in the last step over the cell of particle p minus its own growth."""
-    sums = sums_of_cell(grid, g, group.cell[p])
-    return sums[1] / sums[2] - group.growth[p]
+def missing_growth(grid: ti.template(), g: ti.template(), group: ti.template(), p: int, dt: float):
+    """Return the mean growth of ln J in the last step, of dt, s, over the cell of particle p then minus its own."""
+    sums = sums_of_cell(grid, g, earlier_cell(grid, group, p, dt))
+    return sums[2] / sums[3] - group.growth[p]
 
 
 @ti.func
@@ -189,7 +213,7 @@ def average_for_frame(grid: ti.template(), g: ti.template(), group: ti.template(
     """Store `missing_to_mean` of all particles of a run in `to_mean`, on one thread."""
     for p in range(first, last):
         clear_mean(grid, g, group, p)
-    average_range(grid, g, group, first, last)
+    average_range(grid, g, group, first, last, 0.0)
     for p in range(first, last):
         group.to_mean[p] = missing_to_mean(grid, g, group, p)
 
