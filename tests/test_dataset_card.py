@@ -8,13 +8,14 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from command import run_here
 from made_sweep import COUNT, VERDICTS, made_workers, make_dataset  # noqa: F401
 
 import mpmcli.dataset
 from mpmcli.dataset.export import ExportSettings, export
 from mpmcli.dataset.folder import MANIFEST, Manifest
 from mpmcli.dataset.merge import merge
-from mpmcli.dataset.report import MARKS, DrawnComponent, first_paragraph, histogram, values_of, write_card
+from mpmcli.dataset.report import MARKS, DrawnComponent, first_paragraph, histogram, remove_card, values_of, write_card
 
 pytestmark = pytest.mark.usefixtures("made_workers")
 
@@ -118,6 +119,7 @@ def test_the_picture_is_shown_where_it_lies():
 
 
 BEGIN, END = MARKS
+HOWS = "--resume", "--overwrite"
 
 
 @pytest.mark.parametrize(
@@ -142,6 +144,21 @@ def test_the_text_of_its_owner_is_kept(above, old, below):
     readme.write_bytes(above + old + below if old else above[:-1])
     for _ in range(2):
         assert write_card(dataset).read_bytes() == front + above + card + below
+
+
+@pytest.mark.parametrize("text", ['{"number": 1, "text": "mine"}\n', "1\n", "mine\n"])
+def test_a_table_of_its_owner_is_kept(text):
+    """`dataset card` and a sweep say so before they write, and neither removes it."""
+    dataset = make_dataset("whole")
+    table = dataset / "valid.jsonl"
+    table.write_text(text, encoding="utf-8")
+    before = {path: path.read_bytes() for path in dataset.rglob("*") if path.is_file()}
+    for words in (("dataset", "card", "whole"), *(("sweep", "sweep.toml", "-o", "whole", how) for how in HOWS)):
+        outcome = run_here(*words)
+        assert outcome.status == 2 and "valid.jsonl would be replaced by a table of the card" in outcome.stderr
+        assert before == {path: path.read_bytes() for path in dataset.rglob("*") if path.is_file()}
+    remove_card(dataset)
+    assert table.exists() and not (dataset / "train.jsonl").exists()
 
 
 def test_a_dataset_without_trajectories_has_a_card(monkeypatch):

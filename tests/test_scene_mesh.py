@@ -2,6 +2,7 @@
 
 import copy
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,8 @@ from mpmcli.errors import InputError
 from mpmcli.materials.registry import laws, parameter_models
 from mpmcli.output.header import RunHeader
 from mpmcli.scene import Scene, parse_scene, sample_bodies, scene_to_toml
-from mpmcli.scene.mesh import ClosedSurface, Mesh, _surface_of, read_mesh
+from mpmcli.scene.load import LoadedScene
+from mpmcli.scene.mesh import Mesh, _surface_of, read_mesh
 from mpmcli.scene.points import GeometryFileError, distinct_rows
 from mpmcli.scene.shapes import Ball, Shape, distance_grid
 
@@ -41,14 +43,19 @@ def mesh(path: str, **keys: object) -> Mesh:
     return Mesh.model_validate({"file": path, **keys}, context={"dimension": 3})
 
 
-def scene_of(shape: dict, size: tuple[float, ...] = (1.0, 1.0, 1.0), directory: Path = Path()) -> Scene:
-    """Return a scene of water in a shape."""
+def loaded(shape: dict, directory: Path, size: tuple[float, ...] = (1.0, 1.0, 1.0)) -> LoadedScene:
+    """Return a scene of water in a shape, with its notes."""
     data = {
         "domain": {"size": list(size), "spacing": 0.05},
         "time": {"end": 1.0, "frames": 1},
         "bodies": [{"name": "b", "material": {"law": "fluid", "density": 800.0, "bulk_modulus": 1e5}, "shape": shape}],
     }
-    return parse_scene(copy.deepcopy(data), laws=parameter_models(), directory=directory).scene
+    return parse_scene(copy.deepcopy(data), laws=parameter_models(), directory=directory)
+
+
+def scene_of(shape: dict, size: tuple[float, ...] = (1.0, 1.0, 1.0), directory: Path = Path()) -> Scene:
+    """Return a scene of water in a shape."""
+    return loaded(shape, directory, size).scene
 
 
 def test_the_inside_of_a_ball(tmp_path: Path) -> None:
@@ -81,6 +88,102 @@ def test_the_place_of_a_hole_is_told(tmp_path: Path) -> None:
         read_mesh(tmp_path / "open.ply")
     told = np.array([float(one) for one in str(caught.value).split("at [")[1].split("]")[0].split(",")])
     assert np.linalg.norm(told - whole.vertices[vertex]) < 0.05 * R
+    # The three next, of one triangle each, about its middle.
+    others = re.findall(r"3 edges at \[(.*?)\]", str(caught.value))
+    places = np.array([[float(one) for one in place.split(",")] for place in others])
+    away = np.linalg.norm(places[:, None] - whole.triangles_center[far], axis=-1)
+    assert len(others) == 3 and np.all(away.min(axis=1) < 1e-5) and len({*away.argmin(axis=1)}) == 3
+
+
+def test_small_holes_are_closed(tmp_path: Path) -> None:
+    """Of a ball without seven triangles: its volume again, by pyramids from the middle over them, which the note says.
+
+    The file may be inside out; the volume is that of `scale`^3.
+    """
+    import trimesh
+
+    whole = trimesh.creation.icosphere(subdivisions=3, radius=R)
+    gone = np.arange(len(whole.faces)) % 180 == 0
+    trimesh.Trimesh(whole.vertices, whole.faces[~gone][:, ::-1]).export(tmp_path / "open.ply")
+    found = read_mesh(tmp_path / "open.ply", scale=2.0, close=True)
+    exact = trimesh.load(whole.export(tmp_path / "whole.ply") and tmp_path / "whole.ply", process=False)
+    assert found.volume == pytest.approx(8 * exact.volume, rel=1e-12)
+    pyramids = 8 * np.abs(np.linalg.det(exact.triangles[gone])).sum() / 6
+    assert found.notes == (
+        f"open.ply: close fills {gone.sum()} holes of at most 3 edges, which adds {pyramids:.3g} m^3, "
+        f"{pyramids / found.volume:.2g} of the volume",
+    )
+    scene = {"mesh": {"file": "open.ply", "close": True, "translate": [0.5] * 3}}
+    assert loaded(scene, tmp_path).notes == (f"b: {read_mesh(tmp_path / 'open.ply', close=True).notes[0]}",)
+
+
+def channel(width: float) -> pv.PolyData:
+    """Return a channel of a U-shaped profile, 1 long and open at z = 0, whose rim there has eight edges."""
+    corners = np.array([(0, 0), (3, 0), (3, 3), (3 - width, 3), (3 - width, 1), (width, 1), (width, 3), (0, 3)], float)
+    whole = pv.PolyData(np.pad(corners, ((0, 0), (0, 1))), faces=[8, *range(8)]).triangulate()
+    whole = whole.extrude((0, 0, 1), capping=True).triangulate().clean()
+    flat = whole.cell_centers().points[:, 2] == 0
+    return whole.extract_cells(~flat).extract_surface(algorithm=None)
+
+
+def test_a_hole_that_is_not_convex_is_closed_within_its_rim(tmp_path: Path) -> None:
+    """Volume of the profile, 3 x 1 + 2 x 2 w; between the arms, at the height of the rim, the nearest is an arm."""
+    form = mesh(saved(tmp_path, channel(0.5), "channel.vtp"), close=True)
+    assert form.volume == pytest.approx(3 + 4 * 0.5, rel=1e-12)
+    assert form.signed_distance(np.array([[1.5, 2.5, 0.0], [0.25, 2.0, 0.1]])) == pytest.approx([1.0, -0.1])
+
+
+def test_a_large_hole_is_not_closed(tmp_path: Path) -> None:
+    """The rim of a tube has 13 edges; at twelve it is closed to a prism."""
+    for n in (12, 13):
+        tube = pv.Cylinder(radius=1.0, height=2.0, resolution=n, direction=(0, 0, 1), capping=False).triangulate()
+        path = saved(tmp_path, tube.clean(), f"{n}.vtp")
+    with pytest.raises(GeometryFileError, match=r"round 2 holes, the largest of 13 .* of at most 12 edges"):
+        read_mesh(path, close=True)
+    assert read_mesh(tmp_path / "12.vtp", close=True).volume == pytest.approx(12 * math.sin(math.pi / 6), rel=1e-6)
+
+
+def cube(low: tuple[float, float, float], size: float = 1.0, way: int = 1) -> pv.PolyData:
+    """Return the surface of a cube, which faces inwards with `way` -1."""
+    bounds = np.stack([low, np.add(low, size)], axis=1).ravel()
+    found = pv.Box(bounds=bounds, quads=False)
+    return found if way > 0 else found.flip_faces()
+
+
+@given(st.tuples(*[st.integers(-4, 4)] * 3), st.sampled_from([0.5, 0.75, 1.0]))
+@settings(max_examples=60, deadline=None)
+def test_shells_that_overlap_are_united(tmp_path_factory, steps, size) -> None:
+    """The union of two cubes by inclusion and exclusion, also where they share corners, edges, faces, or all of it."""
+    shift = np.array(steps) / 4
+    path = tmp_path_factory.getbasetemp() / "cubes.vtp"
+    pv.merge([cube((0, 0, 0)), cube(tuple(shift), size)], merge_points=False).save(path, recompute_normals=False)
+    common = np.prod(np.maximum(0, np.minimum(1, shift + size) - np.maximum(0, shift)))
+    assert read_mesh(path).volume == pytest.approx(1 + size**3 - common, rel=1e-6)
+
+
+def test_distances_of_united_shells_are_those_of_the_union(tmp_path: Path) -> None:
+    """Two cubes that make a box of 1.5 x 1 x 1, in which one of 0.2 is hollow; a third lies in that hollow."""
+    parts = [cube((0, 0, 0)), cube((0.5, 0, 0)), cube((0.1, 0.4, 0.4), 0.2, -1), cube((0.15, 0.45, 0.45), 0.1)]
+    form = mesh(saved(tmp_path, pv.merge(parts, merge_points=False), "cubes.vtp"))
+    assert form.volume == pytest.approx(1.5 - 0.2**3 + 0.1**3, rel=1e-6)
+    assert form.surface.notes == ("cubes.vtp: shells that overlap are united, which takes 0.5 m^3, 0.33 of the volume",)
+    points = np.random.default_rng(3).uniform(-0.3, 1.8, (4000, 3)) * [1, 0.8, 0.8]
+
+    def box(low: tuple[float, ...], high: tuple[float, ...]) -> np.ndarray:
+        away = np.maximum(np.array(low) - points, points - high)
+        return np.linalg.norm(np.maximum(away, 0), axis=1) + np.minimum(away.max(axis=1), 0)
+
+    hollow = np.maximum(box((0.1, 0.4, 0.4), (0.3, 0.6, 0.6)), -box((0.15, 0.45, 0.45), (0.25, 0.55, 0.55)))
+    exact = np.maximum(box((0, 0, 0), (1.5, 1, 1)), -hollow)
+    assert np.allclose(form.signed_distance(points), exact, rtol=0, atol=1e-6)
+    assert np.array_equal(form.contains(points), exact < 0)
+
+
+def test_a_triangle_given_twice_is_one(tmp_path: Path) -> None:
+    """A cube each of whose triangles begins at another vertex the second time."""
+    once = cube((0, 0, 0))
+    twice = pv.PolyData.from_regular_faces(once.points, np.concatenate([one := once.regular_faces, np.roll(one, 1, 1)]))
+    assert mesh(saved(tmp_path, twice, "twice.vtp")).volume == pytest.approx(1.0, rel=1e-12)
 
 
 def test_an_off_file_may_begin_with_a_comment(tmp_path: Path) -> None:
@@ -159,13 +262,10 @@ def test_a_mesh_is_scaled_then_turned_then_moved(tmp_path_factory, scale, axis, 
     path = tmp_path_factory.getbasetemp() / "cone.ply"
     if not path.exists():
         pv.Cone(resolution=7).triangulate().save(path)
-    plain, triangles = read_mesh(path)
-    moved, _ = read_mesh(path, scale, axis, angle, shift)
-    assert ClosedSurface(moved, triangles).volume == pytest.approx(
-        scale**3 * ClosedSurface(plain, triangles).volume, rel=1e-6
-    )
+    plain, moved = read_mesh(path), read_mesh(path, scale, axis, angle, shift)
+    assert moved.volume == pytest.approx(scale**3 * plain.volume, rel=1e-6)
     n = np.array(axis) / np.linalg.norm(axis)
-    before, after = scale * plain, moved - shift
+    before, after = scale * plain.vertices, moved.vertices - shift
     assert np.allclose(before @ n, after @ n, rtol=0, atol=1e-9 * (scale + 10))
     across = [v - (v @ n)[:, None] * n for v in (before, after)]
     turned = np.cos(np.radians(angle)) * across[0] + np.sin(np.radians(angle)) * np.cross(n, across[0])
@@ -211,9 +311,15 @@ def test_particles_fill_a_mesh(tmp_path: Path) -> None:
     assert np.linalg.norm(particles.position - 0.5, axis=1).max() < R
 
 
-def two_balls(apart: float) -> pv.PolyData:
-    """Return two balls in one file."""
-    return pv.merge([ball(12), ball(12).translate((apart, 0, 0))])
+def wound_twice(n: int = 11) -> pv.PolyData:
+    """Return a prism on a polygon that goes twice round the middle, outwards: one shell."""
+    turn, radius = 4 * np.pi * np.arange(n) / n, 1 + 0.1 * np.arange(n)
+    rim = np.stack([radius * np.cos(turn), radius * np.sin(turn), np.zeros(n)], axis=1)
+    points = np.concatenate([rim, rim + np.array([0, 0, 1]), [[0, 0, 0], [0, 0, 1]]])
+    i, j = np.arange(n), (np.arange(n) + 1) % n
+    low, high = np.full(n, 2 * n), np.full(n, 2 * n + 1)
+    sides = [(low, j, i), (high, i + n, j + n), (i, j, j + n), (i, j + n, i + n)]
+    return pv.PolyData.from_regular_faces(points, np.concatenate([np.stack(one, axis=1) for one in sides]))
 
 
 BAD = {
@@ -225,7 +331,11 @@ BAD = {
         lambda: pv.PolyData(BOX.points, np.concatenate([BOX.faces[:4][[0, 2, 1, 3]], BOX.faces[4:]])),
         "its triangles face different sides across 3 of 18 edges",
     ),
-    "overlap": (lambda: two_balls(0.3), "its parts overlap, for example at ["),
+    "overlap": (lambda: wound_twice(), "its surface overlaps itself, for example at ["),
+    "inside out": (
+        lambda: pv.merge([cube((0, 0, 0)), cube((2, 0.1, 0.1), 0.02, -1)], merge_points=False),
+        "a part of its surface is inside out, at [2.01, 0.11, 0.11] in its own units",
+    ),
     "points": (lambda: pv.PolyData(np.eye(3)), "it holds no triangle"),
 }
 BOX = pv.Box().triangulate()

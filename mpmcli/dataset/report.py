@@ -5,6 +5,7 @@ Also its card, README.md in its directory: distributions, contents, and code tha
 
 import json
 import math
+import os
 import re
 import tomllib
 from array import array
@@ -216,6 +217,8 @@ _MARKED = re.compile(rb"(?s)%b((?!%b).)*?%b\n?" % (MARKS[0], MARKS[0], MARKS[1])
 # First lines of the front matter; one with other lines is the owner's.
 FRONT = "---", "configs:", "- config_name: default", "  data_files:"
 _FRONT = re.compile(("\n".join(FRONT) + r"\n(?:  - split: \w+\n    path: \S+\n)+---\n+").encode())
+# Entries of a trajectory in the table of its split, after which comes its group in the file.
+_FACTS = "number", "file", "frames", "particles", "draws"
 # Bins of a histogram; if there are few distinct values, each is counted separately.
 BINS = 10
 MOST_COUNTED = 6
@@ -229,8 +232,10 @@ def write_card(directory: Path) -> Path:
     """Write the card of a dataset whose trajectories have all been tried, and tables of its splits; return its path.
 
     Its bytes depend on the sweep and the trajectories alone, not on times, machines, interrupts or parts. It shows the
-    picture montage.png if the directory contains one. Other text in the file is kept.
+    picture montage.png if the directory contains one. Other text in the file is kept. InputError, nothing written: a
+    file of another has the name of a table.
     """
+    require_own_tables(directory)
     manifest = Manifest(directory)
     facts, rows = manifest.facts(), manifest.rows()
     sweep_text = (directory / SWEEP).read_text(encoding="utf-8")
@@ -280,8 +285,8 @@ def remove_card(directory: Path) -> None:
         _put_card(path, b"", b"")
     else:
         path.unlink(missing_ok=True)
-    for name in SPLITS:
-        (directory / table_name(name)).unlink(missing_ok=True)
+    for path in filter(_is_table, (directory / table_name(split) for split in SPLITS)):
+        path.unlink()
     if digest_of(directory / MONTAGE):
         (directory / MONTAGE).unlink()
 
@@ -291,6 +296,20 @@ def table_name(split: str) -> str:
     return f"{split}.jsonl"
 
 
+def require_own_tables(directory: Path) -> None:
+    """Refuse a directory with a file of another under the name of a table: InputError."""
+    for path in (directory / table_name(split) for split in SPLITS):
+        if os.path.lexists(path) and not _is_table(path):
+            raise InputError(f"{path} would be replaced by a table of the card: give it another name.")
+
+
+def _is_table(path: Path) -> bool:
+    try:
+        return all([*json.loads(line)] == [*_FACTS, "group"] for line in path.read_bytes().splitlines())
+    except (OSError, ValueError, TypeError):
+        return False
+
+
 def split_tables(included: Sequence[Row]) -> dict[str, str]:
     """Return a table of each split that has trajectories, as JSON lines by the name of its file, for `load_dataset`.
 
@@ -298,7 +317,7 @@ def split_tables(included: Sequence[Row]) -> dict[str, str]:
     """
     found: dict[str, str] = {}
     for row in sorted(included, key=lambda row: SPLITS.index(row.split)):
-        facts = {name: getattr(row, name) for name in ("number", "file", "frames", "particles", "draws")}
+        facts = {name: getattr(row, name) for name in _FACTS}
         name = table_name(row.split)
         found[name] = found.get(name, "") + json.dumps(facts | {"group": group_name(row.number)}) + "\n"
     return found

@@ -34,7 +34,7 @@ from mpmcli.dataset.folder import (
     source_files,
     standing_alone,
 )
-from mpmcli.dataset.report import final_rows, remove_card, write_card
+from mpmcli.dataset.report import final_rows, remove_card, require_own_tables, write_card
 from mpmcli.dataset.shard import BASE, LABELS, NUMBERED, PENDING, QUARANTINE, SHARDS, SWEEP, file_name
 from mpmcli.dataset.sweep import Sweep
 from mpmcli.errors import InputError
@@ -154,6 +154,7 @@ def open_folder(
     """Make or resume a dataset's directory; call `take` before the first file; InputError: it is unsuitable."""
     directory = settings.directory
     manifest = Manifest(directory)
+    require_own_tables(directory)
     if settings.resume and (directory / MANIFEST).exists():
         facts = manifest.facts()
         i, n = facts["part"]

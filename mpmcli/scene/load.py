@@ -160,6 +160,9 @@ def parse_scene(
             for sentence in (*knobs.get((table, i), []), *sentences):
                 notes.setdefault(sentence, []).append(body.name)
         resolved[table] = tuple(found)
+    for one in (*scene.sources, *scene.colliders):
+        for sentence in one.shape.notes:
+            notes.setdefault(sentence, []).append(one.name)
     told = tuple(f"{several(names)}: {sentence}" for sentence, names in notes.items())
     return LoadedScene(scene.model_copy(update=resolved), told, source)
 

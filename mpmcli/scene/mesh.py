@@ -4,8 +4,9 @@ Closed surfaces of triangles: volume, inside test, and signed distance of points
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cache, cached_property, lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,6 +16,7 @@ from pydantic import Field, PrivateAttr, ValidationInfo, model_validator
 from mpmcli.plain_text import counted
 from mpmcli.scene.points import GeometryFileError, distinct_rows, file_version, read_geometry, scene_file
 from mpmcli.scene.primitives import Solid, grid_points, rotation
+from mpmcli.scene.problem import listed
 from mpmcli.scene.quantity import Axis, Number, Positive, Table, Vector, flaw, place_text
 
 # Points, and pairs of a point and a triangle, per batch: bounds the memory and keeps pairs in the cache.
@@ -43,6 +45,7 @@ class ClosedSurface:
 
     vertices: np.ndarray  # (n, 3), m
     triangles: np.ndarray  # (m, 3), indices of their vertices, counter-clockwise seen from outside
+    notes: tuple[str, ...] = ()  # what was changed in the surface of the file
 
     @cached_property
     def corners(self) -> np.ndarray:
@@ -188,6 +191,8 @@ class _Raster:
 
 # Points per axis at which the surface is tested for parts that overlap or are inside out.
 _TRIED = 24
+# Edges of the largest hole that is closed, and number of holes whose places are told.
+_MOST_EDGES, _MOST_TOLD = 12, 4
 
 
 def read_mesh(
@@ -196,17 +201,25 @@ def read_mesh(
     axis: tuple[float, ...] | None = None,
     angle: float = 0.0,
     translate: tuple[float, ...] = (0.0, 0.0, 0.0),
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the closed surface in a file: vertices (n, 3), m, and triangles (m, 3) that face outwards.
+    close: bool = False,
+) -> ClosedSurface:
+    """Return the closed surface in a file, m, whose triangles face outwards.
 
     The vertices are multiplied by `scale`, turned by `angle` degrees about `axis` through the origin, and moved by
-    `translate`. Vertices at the same place are one. A mesh of cells gives its surface.
+    `translate`. Vertices at the same place are one, as are triangles. A mesh of cells gives its surface. Shells that
+    overlap are united; with `close` holes of few edges are filled.
     """
-    vertices, triangles = _closed(*_read(Path(path)))
+    vertices, triangles, changes = _closed(*_read(Path(path)), close)
+    whole = ClosedSurface(vertices, triangles).volume
+    notes = tuple(
+        f"{Path(path).name}: {what}, which {'adds' if volume > 0 else 'takes'} {abs(volume) * scale**3:.3g} m^3, "
+        f"{abs(volume) / whole:.2g} of the volume"
+        for what, volume in changes.items()
+    )
     vertices = vertices * scale
     if axis is not None:
         vertices = vertices @ rotation(axis, math.radians(angle)).T
-    return vertices + np.array(translate), triangles
+    return ClosedSurface(vertices + np.array(translate), triangles, notes)
 
 
 def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -223,57 +236,180 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
     vertices, triangles = found.vertices[first], which[found.triangles]
     # Merging turns some triangles into edges.
     flat = (triangles == np.roll(triangles, 1, axis=1)).any(axis=1)
-    used = np.bincount(triangles[~flat].ravel(), minlength=len(vertices)) > 0
-    return vertices[used], (np.cumsum(used) - 1)[triangles[~flat]]
+    triangles = triangles[~flat]
+    # A triangle given twice is one.
+    turns = (triangles.argmin(axis=1)[:, None] + np.arange(3)) % 3
+    triangles = triangles[np.sort(distinct_rows(np.take_along_axis(triangles, turns, axis=1))[0])]
+    return _compact(vertices, triangles)
 
 
-def _closed(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return a surface with its triangles facing outwards; raise an error if it is not closed."""
-    directed = np.concatenate([triangles[:, [k, (k + 1) % 3]] for k in range(3)])
-    edges, which = distinct_rows(np.sort(directed, axis=1))
-    uses = np.bincount(which, minlength=len(edges))
-    if len(odd := np.sort(directed, axis=1)[edges[uses % 2 == 1]]):
+def _compact(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the vertices that triangles use, and the triangles with their new numbers."""
+    used = np.bincount(triangles.ravel(), minlength=len(vertices)) > 0
+    return vertices[used], (np.cumsum(used) - 1)[triangles]
+
+
+class _Edges:
+    """Edges of triangles (m, 3): `ends` (n, 2), lower vertex first, their `uses`, and in `ways` those up less down."""
+
+    def __init__(self, triangles: np.ndarray) -> None:
+        directed = np.concatenate([triangles[:, [k, (k + 1) % 3]] for k in range(3)])
+        first, self.which = distinct_rows(ordered := np.sort(directed, axis=1))
+        self.ends, self.way = ordered[first], np.where(directed[:, 0] < directed[:, 1], 1, -1)
+        self.uses = np.bincount(self.which)
+        self.ways = np.bincount(self.which, weights=self.way).astype(np.int64)
+
+    def shells(self) -> np.ndarray:
+        """Return the number of the shell of each triangle: of those that edges join, each closed by itself."""
+        count = len(self.which) // 3
+        order = np.argsort(self.which, kind="stable")
+        edge, triangle = self.which[order], order % count
+        follows = edge[1:] == edge[:-1]
+        pairs = np.stack([triangle[:-1], triangle[1:]], axis=1)
+        shell = _pieces(pairs[follows & (self.uses[edge[1:]] == 2)], count)
+        # Where shells share an edge, those that it does not close are one.
+        _, kind = distinct_rows(np.stack([shell[triangle], edge], axis=1))
+        unclosed = np.bincount(kind, weights=self.way[order])[kind] != 0
+        shared = np.bincount(edge, weights=unclosed)[edge[1:]] > 0
+        return _pieces(pairs[follows & (shared | (self.uses[edge[1:]] == 2))], count)
+
+
+def _closed(
+    vertices: np.ndarray, triangles: np.ndarray, close: bool
+) -> tuple[np.ndarray, np.ndarray, dict[str, float]]:
+    """Return a closed surface with its triangles facing outwards, and the volumes that changes to it have added.
+
+    An error is raised if it is not closed.
+    """
+    changes = {}
+    edges = _Edges(triangles)
+    bounding = np.concatenate([edges.ends[edges.ways == 1][:, ::-1], edges.ends[edges.ways == -1]])
+    if close and (patches := _patches(vertices, bounding)):
+        size = max(map(len, patches)) + 2
+        added = ClosedSurface(vertices, np.concatenate(patches)).volume
+        changes[f"close fills {counted(len(patches), 'hole')} of at most {size} edges"] = added
+        triangles = np.concatenate([triangles, *patches])
+        edges = _Edges(triangles)
+    if len(odd := edges.ends[edges.uses % 2 == 1]):
         raise GeometryFileError(
-            f"its surface is open: {len(odd)} of {len(edges)} edges have a triangle on one side only, "
+            f"its surface is open: {len(odd)} of {len(edges.ends)} edges have a triangle on one side only, "
             f"{_holes(vertices, odd)}"
         )
-    ways = np.bincount(which, weights=np.where(directed[:, 0] < directed[:, 1], 1, -1), minlength=len(edges))
-    if turned := int(np.sum(ways != 0)):
+    if turned := int(np.sum(edges.ways != 0)):
         raise GeometryFileError(
-            f"its triangles face different sides across {turned} of {len(edges)} edges; orient them alike"
+            f"its triangles face different sides across {turned} of {len(edges.ends)} edges; orient them alike"
         )
     surface = ClosedSurface(vertices, triangles)
     if surface.volume < 0:
-        triangles = triangles[:, ::-1]
-        surface = ClosedSurface(vertices, triangles)
-    lower, upper = surface.bounds()
-    if not surface.volume > 1e-12 * float(np.prod(upper - lower)):
+        surface = ClosedSurface(vertices, triangles[:, ::-1])
+        changes = {what: -volume for what, volume in changes.items()}
+    if not surface.volume > 1e-12 * float(np.prod(np.ptp(surface.bounds(), axis=0))):
         raise GeometryFileError("its surface encloses no volume")
-    steps = [np.linspace(a, b, _TRIED + 2)[1:-1] for a, b in zip(lower, upper, strict=True)]
-    points = grid_points(*steps)
-    winding = surface.winding(points)
-    for wrong, said in ((winding < 0, "a part of its surface is inside out"), (winding > 1, "its parts overlap")):
-        if wrong.any():
-            where = place_text(points[np.argmax(wrong)])
-            raise GeometryFileError(f"{said}, for example at {where} in its own units")
-    return vertices, triangles
+    _refuse(lambda winding: winding < 0, surface, "a part of its surface is inside out")
+    if (united := _united(surface, edges.shells())) is not surface:
+        changes["shells that overlap are united"] = united.volume - surface.volume
+    _refuse(lambda winding: winding > 1, united, "its surface overlaps itself")
+    return united.vertices, united.triangles, changes
 
 
-def _holes(vertices: np.ndarray, edges: np.ndarray) -> str:
-    """Return where some edges (n, 2) that lack a triangle lie, and the remedy."""
+def _refuse(wrong: Callable[[np.ndarray], np.ndarray], surface: ClosedSurface, said: str) -> None:
+    """Refuse a surface whose winding number is wrong at some of _TRIED^3 points."""
+    points = grid_points(*(np.linspace(a, b, _TRIED + 2)[1:-1] for a, b in zip(*surface.bounds(), strict=True)))
+    if (there := wrong(surface.winding(points))).any():
+        where = place_text(points[np.argmax(there)])
+        raise GeometryFileError(f"{said}, for example at {where} in its own units")
+
+
+def _patches(vertices: np.ndarray, edges: np.ndarray) -> list[np.ndarray]:
+    """Return triangles of least area, (n - 2, 3), in each loop of n <= _MOST_EDGES of the directed edges (m, 2)."""
+    following: dict[int, list[int]] = {}
+    for start, end in edges.tolist():
+        following.setdefault(start, []).append(end)
+    found = []
+    for start in following:
+        path = {start: None}
+        while ends := following.get(next(reversed(path))):
+            if (end := ends.pop()) not in path:
+                path[end] = None
+                continue
+            loop = [end]
+            while (last := next(reversed(path))) != end:
+                loop.insert(1, last)
+                del path[last]
+            if 2 < len(loop) <= _MOST_EDGES:
+                found.append(np.array(loop)[_least_area(vertices[loop])])
+    return found
+
+
+def _least_area(loop: np.ndarray) -> np.ndarray:
+    """Return the triangles (n - 2, 3) of least area between the vertices (n, 3) of a loop, in their sense."""
+    sides = loop[:, None] - loop
+    areas = np.linalg.norm(np.cross(sides[:, :, None], sides[:, None]), axis=-1)
+
+    @cache
+    def least(i: int, j: int) -> tuple[float, tuple[tuple[int, int, int], ...]]:
+        ways = ((least(i, k), least(k, j), k) for k in range(i + 1, j))
+        return min(((a + b + areas[i, k, j], (*s, *t, (i, k, j))) for (a, s), (b, t), k in ways), default=(0.0, ()))
+
+    return np.array(least(0, len(loop) - 1)[1])
+
+
+def _united(surface: ClosedSurface, numbers: np.ndarray) -> ClosedSurface:
+    """Return the union of the shells, by number (m,), of the triangles of a surface, each with its cavities.
+
+    It is the surface itself if no shells overlap.
+    """
+    from manifold3d import Error, Manifold, Mesh64, OpType
+
+    order = np.argsort(numbers, kind="stable")
+    cuts = np.flatnonzero(np.diff(numbers[order])) + 1
+    if not len(cuts):
+        return surface
+    shells = [
+        (ClosedSurface(*_compact(surface.vertices, one)), one) for one in np.split(surface.triangles[order], cuts)
+    ]
+    # The least of the shells round a cavity is that of the cavity.
+    outer = sorted((shell for shell in shells if shell[0].volume > 0), key=lambda shell: shell[0].volume)
+    groups = [[triangles] for _, triangles in outer]
+    lower, upper = np.moveaxis(np.array([shell.bounds() for shell, _ in outer]), 1, 0)
+    for inner, triangles in (shell for shell in shells if shell[0].volume <= 0):
+        low, high = inner.bounds()
+        around = np.flatnonzero((lower <= low).all(axis=1) & (upper >= high).all(axis=1))
+        own = next((k for k in around if outer[k][0].winding(inner.vertices[:1])[0] > 0), None)
+        if own is not None:
+            groups[own].append(triangles)
+        elif inner.volume < -1e-6 * surface.volume:  # others are slivers
+            where = place_text(inner.vertices.mean(axis=0))
+            raise GeometryFileError(f"a part of its surface is inside out, at {where} in its own units")
+    solids = [Manifold(Mesh64(*_compact(surface.vertices, np.concatenate(group)))) for group in groups]
+    whole = Manifold.batch_boolean(solids, OpType.Add)
+    taken = sum(solid.volume() for solid in solids) - whole.volume()
+    if whole.status() != Error.NoError or taken < 1e-9 * surface.volume:
+        return surface
+    mesh = whole.to_mesh64()
+    return ClosedSurface(np.array(mesh.vert_properties), np.array(mesh.tri_verts, np.int64))
+
+
+def _pieces(edges: np.ndarray, count: int) -> np.ndarray:
+    """Return for each of `count` nodes the number of the piece to which edges (n, 2) join it."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    n = len(vertices)
-    joined = coo_array((np.ones(len(edges)), edges.T), shape=(n, n))
-    hole = connected_components(joined, directed=False)[1][edges[:, 0]]
+    return connected_components(coo_array((np.ones(len(edges)), edges.T), shape=(count, count)), directed=False)[1]
+
+
+def _holes(vertices: np.ndarray, edges: np.ndarray) -> str:
+    """Return where the largest holes that some edges (n, 2) lie round are, and the remedy."""
+    hole = _pieces(edges, len(vertices))[edges[:, 0]]
     sizes = np.bincount(hole)
-    largest = int(np.argmax(sizes))
-    where = place_text(vertices[np.unique(edges[hole == largest])].mean(axis=0))
-    count = int(np.count_nonzero(sizes))
+    largest = np.argsort(-sizes, kind="stable")[: min(_MOST_TOLD, np.count_nonzero(sizes))]
+    places = [place_text(vertices[np.unique(edges[hole == one])].mean(axis=0)) for one in largest]
+    first, *others = (f"{sizes[one]} edges at {where}" for one, where in zip(largest, places, strict=True))
+    more = f"; others of {listed(others, 'and')}" if others else ""
     return (
-        f"round {counted(count, 'hole')}, the largest of {sizes[largest]} edges at {where} in its own units; fill "
-        "holes and merge points that nearly coincide, as MeshLab and Blender do"
+        f"round {counted(int(np.count_nonzero(sizes)), 'hole')}, the largest of {first}{more} in its own units; "
+        f"close = true fills holes of at most {_MOST_EDGES} edges, and MeshLab and Blender fill others and merge "
+        "points that nearly coincide"
     )
 
 
@@ -294,6 +430,7 @@ class Mesh(Table, Solid):
     scale: Positive = Field(1.0, description="Metres per unit of the file; 0.001 for millimetres.")
     rotate: Rotation | None = Field(None, description="Rotation, after scaling. Default: none.")
     translate: Vector = Field(None, validate_default=True, description="Translation, added to all vertices last, m.")
+    close: bool = Field(False, description="Fill holes of at most 12 edges.")
     _surface: ClosedSurface = PrivateAttr()
 
     @model_validator(mode="after")
@@ -301,7 +438,9 @@ class Mesh(Table, Solid):
         path = scene_file(self.file, info)
         turn = (self.rotate.axis, self.rotate.angle) if self.rotate else (None, 0.0)
         try:
-            self._surface = _surface_of(path.absolute(), file_version(path), self.scale, *turn, self.translate)
+            self._surface = _surface_of(
+                path.absolute(), file_version(path), self.scale, *turn, self.translate, self.close
+            )
         except GeometryFileError as error:
             raise flaw(f"{path}: {error}", "file") from None
         return self
@@ -363,4 +502,4 @@ def moved_inside(mesh: Mesh, lower: np.ndarray, upper: np.ndarray) -> str:
 @lru_cache(maxsize=32)
 def _surface_of(path: Path, version: tuple[int, int], *placement: Any) -> ClosedSurface:
     """Return the surface in a file; `version` distinguishes versions of the file. The result is cached."""
-    return ClosedSurface(*read_mesh(path, *placement))
+    return read_mesh(path, *placement)

@@ -284,6 +284,12 @@ class Shape(Table):
         others = [file for shape in (*(self.add or ()), *(self.subtract or ())) for file in shape.files]
         return [self.mesh.file, *others] if self.mesh else others
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was changed in the surfaces of meshes."""
+        own = self.mesh.surface.notes if self.mesh else ()
+        return (*own, *(note for one in (*(self.add or ()), *(self.subtract or ())) for note in one.notes))
+
 
 class BodyShape(Shape):
     """The shape of a body: a form, or points from a file."""

@@ -1,0 +1,123 @@
+"""Programs of others read what mpmcli writes: Hugging Face's datasets, GNS's loader, ParaView's pvpython.
+
+MPMCLI_CONSUMERS names a directory of environments: `datasets` with that package; `gns` with numpy and GNS's
+data_loader.py, which takes from torch its base class alone. pvpython is the one on the path. What is absent is skipped.
+"""
+
+import json
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command import run_here
+from made_dataset import SPLITS, made_trajectory, write_dataset
+from made_result import write_made
+from made_sweep import COUNT, VERDICTS, made_workers, make_dataset  # noqa: F401
+
+import mpmcli.dataset
+from mpmcli.output import open_result
+
+INPUTS = 6
+
+
+def told(program: str | Path, code: str, *arguments: object) -> dict:
+    """Run Python code in an interpreter with its own environment, and return the JSON that it prints last."""
+    if not shutil.which(program):
+        pytest.skip(f"{program} is absent")
+    Path("read.py").write_text(code, encoding="utf-8")
+    variables = {"PATH": os.environ["PATH"], "HOME": os.getcwd(), "HF_HUB_OFFLINE": "1"}
+    words = [str(program), "read.py", *map(str, arguments)]
+    outcome = subprocess.run(words, env=variables, capture_output=True, text=True, timeout=300, check=False)
+    assert outcome.returncode == 0, outcome.stderr
+    return json.loads(outcome.stdout.splitlines()[-1])
+
+
+def environment(name: str) -> Path:
+    """Return the interpreter of an environment."""
+    return Path(os.environ.get("MPMCLI_CONSUMERS", "/absent"), name, "bin", "python")
+
+
+DATASETS = """
+import json, sys
+from datasets import load_dataset
+from huggingface_hub import DatasetCard
+(config,) = DatasetCard.load(sys.argv[1] + "/README.md").data.to_dict()["configs"]
+splits = {name: table.to_list() for name, table in load_dataset(sys.argv[1]).items()}
+print(json.dumps({"card": [one["split"] for one in config["data_files"]], "splits": splits}))
+"""
+
+
+@pytest.mark.usefixtures("made_workers")
+def test_load_dataset_has_the_splits_without_the_quarantine() -> None:
+    """The numbers, draws and places of the included trajectories, split by split, as the card names them."""
+    path = make_dataset("whole").resolve()
+    opened, found = mpmcli.dataset.open(path), told(environment("datasets"), DATASETS, path)
+    assert sorted(found["card"]) == sorted(found["splits"]) == sorted(opened.splits)
+    for split, numbers in opened.splits.items():
+        assert [row["number"] for row in found["splits"][split]] == list(numbers)
+        assert all(json.loads(row["draws"]) == opened[row["number"]].draws for row in found["splits"][split])
+    loaded = {row["number"] for rows in found["splits"].values() for row in rows}
+    assert loaded == {*range(COUNT)} - {*VERDICTS} and any((path / "quarantine").iterdir())
+
+
+GNS = """
+import json, sys
+from types import SimpleNamespace as Name
+sys.path.insert(0, sys.argv[1])
+sys.modules["torch"] = Name(utils=Name(data=Name(Dataset=object)))
+from data_loader import SamplesDataset
+data = SamplesDataset(sys.argv[2], int(sys.argv[3]))
+(position, kind, *feature, n), label = data[int(sys.argv[4])]
+print(json.dumps({"length": len(data), "position": position.tolist(), "kind": kind.tolist(), "n": n,
+                  "feature": [one.tolist() for one in feature], "label": label.tolist()}))
+"""
+
+
+@pytest.mark.parametrize("viscosity", [0.0, 0.5], ids=["alike", "a feature"])
+def test_gns_reads_samples_with_its_own_loader(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, viscosity: float
+) -> None:
+    """The last sample: inputs and label are those of the trajectory; a viscosity that differs is a feature."""
+    monkeypatch.chdir(tmp_path)
+    made = [made_trajectory(k, viscosity=viscosity * k, split=split) for k, split in enumerate(SPLITS)]
+    path = write_dataset(tmp_path / "set", made)
+    assert run_here("export", path, "--to", "gns", "-o", tmp_path / "out").status == 0
+    positions = [mpmcli.dataset.open(path)[k].position for k in (0, 1)]
+    length = sum(len(one) - INPUTS for one in positions)
+    python = environment("gns")
+    found = told(python, GNS, python.parents[1], tmp_path / "out" / "train.npz", INPUTS, length - 1)
+    assert found["length"] == length and found["n"] == positions[1].shape[1]
+    np.testing.assert_array_equal(np.array(found["label"], np.float32), positions[1][-1])
+    inputs = positions[1][-1 - INPUTS : -1].transpose(1, 0, 2)
+    np.testing.assert_array_equal(np.array(found["position"], np.float32), inputs)
+    first = np.asarray(made[1].body) == 0
+    assert found["kind"] == np.where(first, 5, 6).tolist()
+    assert found["feature"] == ([np.where(first, viscosity, 0.0).tolist()] if viscosity else [])
+
+
+PARAVIEW = """
+import json, sys
+from paraview import servermanager
+from paraview.simple import OpenDataFile, UpdatePipeline
+reader, found = OpenDataFile(sys.argv[1]), []
+for time in reader.TimestepValues:
+    UpdatePipeline(time=time, proxy=reader)
+    blocks = servermanager.Fetch(reader)
+    piece = blocks.GetBlock(0) if hasattr(blocks, "GetBlock") else blocks
+    points = [piece.GetPoint(i) for i in range(piece.GetNumberOfPoints())]
+    found.append({"time": time, "points": points})
+print(json.dumps(found))
+"""
+
+
+def test_pvpython_reads_every_frame_of_the_vtk_export(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    path = write_made(tmp_path / "run", dimension=3)
+    assert run_here("export", path, "--to", "vtk", "-o", tmp_path / "out").status == 0
+    found, frames = told("pvpython", PARAVIEW, tmp_path / "out" / "000000.pvd"), list(open_result(path).frames())
+    assert [one["time"] for one in found] == pytest.approx([frame.time for frame in frames])
+    for one, frame in zip(found, frames, strict=True):
+        np.testing.assert_array_equal(np.array(one["points"], np.float32), frame.position)
