@@ -288,6 +288,15 @@ def test_every_format_gives_the_same_surface(tmp_path: Path, name: str) -> None:
     assert np.allclose(form.bounds(), [[0, 0, 0], [3, 2, 1]], atol=1e-6)
 
 
+def test_cells_may_be_inside_out(tmp_path: Path) -> None:
+    """A box of tetrahedra, every third of which has a negative volume."""
+    cells = pv.ImageData(dimensions=(4, 3, 2)).to_tetrahedra()
+    corners = cells.cells.reshape(-1, 5).copy()
+    corners[::3, 1:3] = corners[::3, 2:0:-1]
+    pv.UnstructuredGrid(corners, cells.celltypes, cells.points).save(tmp_path / "m.vtu")
+    assert mesh(str(tmp_path / "m.vtu")).volume == pytest.approx(6.0, rel=1e-6)
+
+
 def test_a_binary_ply_may_mix_triangles_and_quads(tmp_path: Path) -> None:
     """A cube of five quads and two triangles, as programs for modelling write it."""
     corners = [(x, y, z) for z in (0, 1) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))]

@@ -134,7 +134,7 @@ def _by_vtk(path: Path) -> Geometry:
     import pyvista as pv
     from vtkmodules.util.numpy_support import vtk_to_numpy
     from vtkmodules.vtkCommonCore import vtkLogger, vtkObject
-    from vtkmodules.vtkFiltersCore import vtkTriangleFilter
+    from vtkmodules.vtkFiltersCore import vtkPolyDataNormals, vtkTriangleFilter
     from vtkmodules.vtkFiltersGeometry import vtkDataSetSurfaceFilter
 
     shown, told = vtkObject.GetGlobalWarningDisplay(), vtkLogger.GetCurrentVerbosityCutoff()
@@ -155,8 +155,13 @@ def _by_vtk(path: Path) -> Geometry:
         triangles.SetInputConnection(surface.GetOutputPort())
         triangles.PassVertsOff()
         triangles.PassLinesOff()
-        triangles.Update()
-        result = triangles.GetOutput()
+        # The surface of cells that are inside out faces both ways.
+        alike = vtkPolyDataNormals()
+        alike.SetInputConnection(triangles.GetOutputPort())
+        alike.SplittingOff()
+        last = triangles if found.IsA("vtkPolyData") else alike
+        last.Update()
+        result = last.GetOutput()
     finally:
         vtkObject.SetGlobalWarningDisplay(shown)
         vtkLogger.SetStderrVerbosity(told)
