@@ -97,7 +97,13 @@ def test_runs_part_where_rounding_moves_half_a_percent_of_the_mass() -> None:
 
 @pytest.mark.parametrize(
     ("value", "bar", "said"),
-    [(0.8314, 0.0234, "0.831 ± 0.023"), (0.8314, 0.051, "0.83 ± 0.05"), (12401, 54.2, "12401 ± 54"), (0.2, 3, "0 ± 3")],
+    [
+        (0.8314, 0.0234, "0.831 ± 0.023"),
+        (0.8314, 0.051, "0.83 ± 0.05"),
+        (12401, 54.2, "12401 ± 54"),
+        (0.2, 3, "0 ± 3"),
+        (0.459, 0.0099, "0.459 ± 0.010"),
+    ],
 )
 def test_a_value_has_the_digits_of_its_bar(value: float, bar: float, said: str) -> None:
     found = bars_of(series_of(a__low__x=value), [(grid(2.0), series_of(a__low__x=value + bar))])

@@ -8,7 +8,6 @@ study.
 """
 
 import json
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -63,7 +62,8 @@ class Bar:
             return f"{value:.6g}, exact to rounding"
         if not 1e-4 <= bar < 1e5:
             return f"{value:.3g} ± {bar:.1g}"
-        digits = max(0, (f"{bar:.0e}"[0] < "3") - math.floor(math.log10(bar)))
+        leading, power = f"{bar:.0e}".split("e")
+        digits = max(0, (leading < "3") - int(power))
         return f"{value + 0.0:.{digits}f} ± {bar:.{digits}f}"
 
     def main_cause(self, k: int) -> str:

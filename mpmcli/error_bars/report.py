@@ -30,14 +30,16 @@ FINEST, COARSEST = 16.0, 2.0
 
 
 def headline(scene: Scene, bars: Bars) -> str:
-    """Return the name of the observable that says most: the front of what flows, else the centre that moves most."""
+    """Return the name of what moves most: a front of what flows, or the centre of an elastic or rigid body."""
     gravity = scene.domain.gravity_at(0.0)
     across = [a for a in range(scene.dimension) if not gravity[a]] or list(range(scene.dimension))
     flows = [source.name for source in scene.sources if not source.has_surface]
+    others = [f"{source.name}.centre" for source in scene.sources if source.has_surface]
+    others += [collider.name for collider in scene.colliders if collider.free]
     names = [f"{name}.{side}.{AXES[a]}" for name in flows for side in ("low", "high") for a in across]
-    if not any(name in bars.of for name in names):
-        names = [name for name in bars.of if ".centre." in name] or [name for name in bars.of if name != DENSITY]
-    found = [name for name in names if name in bars.of]
+    names += [f"{name}.{axis}" for name in others for axis in AXES]
+    # Along periodic axes there is neither.
+    found = [name for name in names if name in bars.of] or [name for name in bars.of if name != DENSITY]
     return max(found, key=lambda name: np.nan_to_num(np.ptp(bars.of[name].value[np.isfinite(bars.of[name].value)])))
 
 

@@ -62,8 +62,8 @@ class Study:
         shared = [source for source in self.scene.sources if not self.scene.separates(source)]
         if len(shared) > 1 and any(source.has_surface for source in shared):
             found.append('Bodies stick: the bar does not contain that; contact.default = "separate" parts them.')
-        if any(collider.free for collider in self.scene.colliders) and self.scene.sources:
-            found.append("Rigid bodies meet material up to a cell from their surface: the bar may not contain that.")
+        if self.scene.colliders and not all(source.has_surface for source in self.scene.sources):
+            found.append("Liquids and grains keep up to 1.5 cells from colliders: the bar may not contain that.")
         coarsest = self.scene.domain.spacing * max((one.ratio for one, _ in self.runs), default=1.0)
         boxes = {body.name: np.ptp(np.array(body.shape.form.bounds()), axis=0) for body in self.scene.bodies}
         if thin := [name for name, size in boxes.items() if size.min() < THIN * coarsest]:
