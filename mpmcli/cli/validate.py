@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from mpmcli.validation.runs import Journal
 
 
-@click.command("validate", epilog="Examples: mpmcli validate couette --levels coarse; mpmcli validate drop.toml")
+@click.command("validate", epilog="Example: mpmcli validate couette --levels coarse")
 @click.argument("names", nargs=-1, metavar="[CASE|SCENE]...")
 @choice_option(
     "--levels level",

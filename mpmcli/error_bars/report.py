@@ -22,7 +22,7 @@ from mpmcli.scene.quantity import AXES
 
 PAGE, BANDS, COST = "report.md", "bands.svg", "cost.svg"
 HEAD = ("observable", "value", "% of its size", "causes")
-RUNS = ("run", "cause", "spacing, m", "particles", "steps", "seconds", "mass elsewhere", "headline off by")
+RUNS = ("run", "cause", "spacing, m", "particles", "steps", "seconds", "error: mass elsewhere", "error: headline")
 # Panels of the figure of bands, and its size and that of the other, pixels.
 PANELS, SIZE, SMALL = 6, (1200, 900), (800, 500)
 # Finest grid that a target is extrapolated to, as a factor on the spacing, and the coarsest.
@@ -97,16 +97,17 @@ def remarks(study: Study) -> list[str]:
 
 
 def cost_rows(study: Study) -> list[tuple[str, ...]]:
-    """Return the rows of all runs, the scene first: what each costs, and how far it is from the scene.
+    """Return the rows of all runs, the scene first: what each costs, and its error.
 
-    That of the scene itself is its bar; all are means over the frames.
+    That of the scene is its bar, that of a sibling the bar and its distance from the scene; means over the frames.
     """
     name, bars = headline(study.scene, study.bars), study.bars
     h, base = study.scene.domain.spacing, study.base
-    found = [("the scene", "", base, h, bars.of[DENSITY].bar, bars.of[name].bar)]
+    own = bars.of[DENSITY].bar, bars.of[name].bar
+    found = [("the scene", "", base, h, *own)]
     for one, run in study.runs:
-        off = np.abs(run.values[name] - base.values[name])
-        found.append((one.name, one.cause, run, one.ratio * h, distance(run, base), off))
+        away = own[0] + distance(run, base), own[1] + np.abs(run.values[name] - base.values[name])
+        found.append((one.name, one.cause, run, one.ratio * h, *away))
     rows = []
     for label, cause, run, spacing, *off in found:
         means = (plain_number(float(np.nanmean(each))) for each in off)
@@ -176,7 +177,7 @@ def write(study: Study, directory: Path) -> None:
         f"![Observables and their bars over time]({BANDS})",
         markdown_table(HEAD, rows_of(bars), {0, 1, 3}),
         "## Speed against error",
-        "Means over all frames of how far a run is from the scene; for the scene itself, its bar.",
+        "The error of the scene is its bar, that of a sibling the bar plus its distance from the scene; means over time.",
         markdown_table(RUNS, cost_rows(study), {0, 1}),
         f"![Seconds against error]({COST})",
     ]
@@ -207,14 +208,21 @@ def draw_bands(study: Study) -> bytes:
 
 def draw_cost(study: Study) -> bytes:
     """Return a figure of seconds against the share of the mass that is elsewhere, as SVG."""
+    from matplotlib.ticker import LogLocator
+
     with drawing(SMALL, THEMES["light"]) as figure:
         axes = figure.subplots(subplot_kw={"xscale": "log", "yscale": "log"})
         bars, base = study.bars, study.base
-        points = [("the scene", base.seconds, float(bars.of[DENSITY].bar.mean()))]
-        points += [(one.name, run.seconds, float(distance(run, base).mean())) for one, run in study.runs]
+        own = float(bars.of[DENSITY].bar.mean())
+        points = [("the scene", base.seconds, own)]
+        points += [(one.name, run.seconds, own + float(distance(run, base).mean())) for one, run in study.runs]
         for k, (name, seconds, off) in enumerate(points):
             color = LIGHT_SERIES[k % len(LIGHT_SERIES)]
             axes.plot([max(seconds, 1e-3)], [max(off, 1e-9)], "os"[k == 0], color=color, label=name)
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            axis.set_major_formatter("{x:g}")
+            axis.set_minor_formatter("")
         axes.set(xlabel="seconds", ylabel="share of the mass that is elsewhere", title="Seconds against error")
         axes.legend()
         return _svg(figure)
