@@ -177,7 +177,7 @@ def write(study: Study, directory: Path) -> None:
         f"![Observables and their bars over time]({BANDS})",
         markdown_table(HEAD, rows_of(bars), {0, 1, 3}),
         "## Speed against error",
-        "The error of the scene is its bar, that of a sibling the bar plus its distance from the scene; means over time.",
+        "The error of the scene is its bar, that of a sibling the bar plus its distance from the scene; all are means.",
         markdown_table(RUNS, cost_rows(study), {0, 1}),
         f"![Seconds against error]({COST})",
     ]
