@@ -55,7 +55,8 @@ def plan_for(loaded: "LoadedScene", directory: Path | None, asked: dict[str, Any
     causes = chosen_causes(asked.get("bar_level") or table.level, asked.get("only", ()), asked.get("skip", ()))
     texts = (*(f"{name}={text}" for name, text in table.observe.items()), *asked.get("observe", ()))
     observed = read_observed(texts, loaded.scene)
-    return Plan(causes, int(asked.get("confidence") or table.confidence), observed, directory)
+    device = {"arch": asked.get("arch", "auto"), "threads": asked.get("threads")}
+    return Plan(causes, int(asked.get("confidence") or table.confidence), observed, directory, **device)
 
 
 def within_budget(plan: "Plan", dimension: int, seconds: float, runs: float, budget: float) -> "Plan":

@@ -155,6 +155,8 @@ class Runner:
         """
         particles = particles or sample_bodies(scene)
         backend = self._choose(scene)
+        if self._alike:
+            require_memory(make_plan(scene, backend))
         if self._keeps(scene, particles, backend):
             backend = replace(backend, threads=1) if backend.on_cpu and not self._alike else backend
             run = Run(self._batch_for(CompiledKind.of(scene, particles), backend), 0, scene, particles)
