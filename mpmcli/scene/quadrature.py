@@ -109,7 +109,8 @@ class _Window:
         half = 0.5 * (parts.high - parts.low)
         coefficients = parts.values @ ANTIDERIVATIVES * half[:, None]
         coefficients[:, 0] += np.concatenate([[0.0], np.cumsum(_rule(parts.values, parts.low, parts.high))[:-1]])
-        low, high = (np.broadcast_to(side, half.shape) for side in bounds_of(tree, {"t": (parts.low, parts.high)}))
+        within = np.nextafter(parts.low, parts.high), np.nextafter(parts.high, parts.low)
+        low, high = (np.broadcast_to(side, half.shape) for side in bounds_of(tree, {"t": within}))
         bound = np.maximum(np.abs(low), np.abs(high))
         sampled = np.abs(np.where(np.isfinite(parts.values), parts.values, 0.0)).max(axis=1)
         bound = np.where(np.isfinite(bound), bound, sampled)
