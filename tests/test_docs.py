@@ -194,7 +194,9 @@ def test_the_commands_make_what_the_readme_says(commands, checkout):
     assert open_result(checkout / "results" / "faster").times[-1] == 0.4
     assert commands["python load.py"].stdout.splitlines()[0].startswith("1 (51, ")
     assert json.loads((checkout / "scene.schema.json").read_text(encoding="utf-8"))["title"] == "Scene"
+    assert "centre of ball, y, at 1 s: 0.3" in commands["mpmcli validate results/drop"].stdout
     assert sorted(path.name for path in (checkout / "results" / "drop").iterdir()) == [
+        "error_bars",
         "ledger.png",
         "particles.vtkhdf",
         "render",
