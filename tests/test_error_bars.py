@@ -321,12 +321,14 @@ def test_a_target_gives_the_spacing_of_first_order() -> None:
             report.target_text(study, *report.target_of(text))
 
 
-def test_bodies_that_stick_are_warned_of() -> None:
-    assert (
-        "Bodies stick" in " ".join(Study(scene_of(name="stack_2d"), series_of()).warnings())
-        or scene_of(name="stack_2d").contact.default == "separate"
-    )
-    assert not any("stick" in line for line in Study(scene_of(), series_of(), [(grid(2.0), series_of())]).warnings())
+def test_what_bars_do_not_contain_is_said() -> None:
+    def told(*overrides: str, name: str) -> str:
+        return " ".join(Study(scene_of(*overrides, name=name), series_of(), [(grid(2.0), series_of())]).warnings())
+
+    assert "Bodies stick" in told('contact={default="stick"}', name="billiard_2d")
+    assert "Bodies stick" not in told('contact={default="separate"}', name="billiard_2d")
+    assert "from colliders" in told(name="hourglass_2d") and told(name="dam_break_2d") == ""
+    assert "column: fewer than 4 cells thick" in told("domain.spacing=0.15", name="dam_break_2d")
 
 
 def test_a_scene_without_siblings_is_told_so(tmp_path: Path) -> None:
@@ -341,7 +343,7 @@ def test_a_scene_without_siblings_is_told_so(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("--level", "step", "--budget", "1h"), "give --level or --budget"),
+        (("--level", "step", "--budget", "1h"), "without --level, --only and --skip"),
         (("--only", "grids"), 'there is no cause "grids"'),
         (("--skip", "grid"), "leaves nothing to compute"),
         (("--budget", "0.001s"), "allows nothing"),

@@ -50,8 +50,8 @@ def plan_for(loaded: "LoadedScene", directory: Path | None, asked: dict[str, Any
     for name in ("only", "skip"):
         for unknown in (cause for cause in asked.get(name, ()) if cause not in CAUSES):
             raise InputError(f'--{name}: there is no cause "{unknown}"; there are {", ".join(CAUSES)}.')
-    if asked.get("bar_level") and asked.get("budget"):
-        raise InputError("--budget chooses the level; give --level or --budget.")
+    if asked.get("budget") and (asked.get("bar_level") or asked.get("only") or asked.get("skip")):
+        raise InputError("--budget chooses the level: give it without --level, --only and --skip.")
     causes = chosen_causes(asked.get("bar_level") or table.level, asked.get("only", ()), asked.get("skip", ()))
     texts = (*(f"{name}={text}" for name, text in table.observe.items()), *asked.get("observe", ()))
     observed = read_observed(texts, loaded.scene)

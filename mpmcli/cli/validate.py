@@ -135,12 +135,12 @@ def _scene_of(names: Sequence[str]) -> Path | None:
     known = all_cases()
     found = []
     for name in names:
-        if name in known:
+        if name in known or any(case.startswith(f"{name}_") for case in known):
             continue
         path = Path(name)
         if path.suffix or path.exists():
             found.append(path)
-        elif name in examples() and not any(case.startswith(f"{name}_") for case in known):
+        elif name in examples():
             found.append(examples()[name])
     if found and len(names) > 1:
         raise InputError(f"error bars are those of one scene: give {found[0]} alone.")

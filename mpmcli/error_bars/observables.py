@@ -63,7 +63,6 @@ class Series:
         values: (K,) by name; NaN where there is none.
         maps: (K, M), shares of the mass.
         reach: of particles and rigid bodies; `seconds`: wall time without compilation; `steps`, `particles`: counts.
-        verdict: that of the check of the run.
     """
 
     time: np.ndarray
@@ -73,7 +72,6 @@ class Series:
     seconds: float = 0.0
     steps: int = 0
     particles: int = 0
-    verdict: str = ""
 
 
 @dataclass

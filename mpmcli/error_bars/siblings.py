@@ -42,13 +42,12 @@ NUDGE = 1 + 1e-6
 
 @dataclass(frozen=True)
 class Sibling:
-    """A changed scene: its name, its cause, its tables, its spacing over that of the scene, and its cost in runs."""
+    """A changed scene: its name, its cause, its tables, and its spacing over that of the scene."""
 
     name: str
     cause: Cause
     tables: Tables
     ratio: float = 1.0
-    cost: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -113,7 +112,7 @@ def coarser(tables: Tables, reach: Reach, target: float) -> Sibling | LeftOut:
         domain["size"][k] = cells * new
     domain["spacing"] = new
     ratio = new / old
-    return Sibling(f"spacing x {ratio:.3g}", "grid", changed, ratio, ratio ** -(len(fixed) + 1))
+    return Sibling(f"spacing x {ratio:.3g}", "grid", changed, ratio)
 
 
 def fixed_faces(tables: Tables, reach: Reach) -> list[tuple[bool, bool]]:
@@ -176,7 +175,7 @@ def half_step(tables: Tables) -> Sibling:
     """Return the scene with steps half as long."""
     time = tables["time"]
     changed = {"safety": time["safety"] / 2} | ({} if time["step"] == "auto" else {"step": time["step"] / 2})
-    return Sibling("half step", "step", {**copy.deepcopy(tables), "time": {**time, **changed}}, cost=2.0)
+    return Sibling("half step", "step", {**copy.deepcopy(tables), "time": {**time, **changed}})
 
 
 def shifted(tables: Tables, reach: Reach, share: float) -> Sibling | LeftOut:
@@ -196,10 +195,9 @@ def shifted(tables: Tables, reach: Reach, share: float) -> Sibling | LeftOut:
 def samples(tables: Tables) -> Iterator[Sibling | LeftOut]:
     """Yield the scene with more particles, and with another sample of like quality."""
     d, more, other = len(tables["domain"]["size"]), copy.deepcopy(tables), copy.deepcopy(tables)
-    factor = 1.0
     for source in _sampled(more):
         axis = round(source["particles_per_cell"] ** (1 / d))
-        source["particles_per_cell"], factor = (axis + 1) ** d, max(factor, ((axis + 1) / axis) ** d)
+        source["particles_per_cell"] = (axis + 1) ** d
     for source in _sampled(other):
         source["seed"] += 1
         if source["sampling"] == "lattice":
@@ -210,7 +208,7 @@ def samples(tables: Tables) -> Iterator[Sibling | LeftOut]:
     if more == tables:
         yield LeftOut("other sample", "sample", "all particles are given as points")
         return
-    yield Sibling("more particles", "sample", more, cost=factor)
+    yield Sibling("more particles", "sample", more)
     yield Sibling("other sample", "sample", other)
 
 

@@ -182,7 +182,7 @@ class Student:
         recording = self._runner.run(scene, stop, observer.take, particles)
         if recording.verdict in BROKEN:
             raise RunError(f"The run of {name} is {recording.verdict}: {recording.reason}")
-        facts = {name: getattr(recording, name) for name in ("seconds", "steps", "particles", "verdict")}
+        facts = {name: getattr(recording, name) for name in _Kept.FACTS}
         series = replace(observer.series(), **facts)
         kept.keep(series)
         return series
@@ -196,7 +196,7 @@ class _Kept:
     """The file of one series; it is found again for the same tables, map, observables and program."""
 
     ARRAYS = ("time", "maps")
-    FACTS = ("seconds", "steps", "particles", "verdict")
+    FACTS = ("seconds", "steps", "particles")
 
     def __init__(self, student: Student, name: str, tables: Mapping[str, Any]) -> None:
         plan = student.plan
@@ -220,9 +220,15 @@ class _Kept:
             return None
 
     def keep(self, series: Series) -> None:
-        """Write the series, if there is a directory."""
+        """Write the series, if there is a directory. Raises RunError on failure."""
         if self._path is None:
             return
+        try:
+            self._write(series)
+        except OSError as error:
+            raise RunError(f"{self._path} could not be written ({error.strerror or error}).") from error
+
+    def _write(self, series: Series) -> None:
         self._path.parent.mkdir(parents=True, exist_ok=True)
         names, rows = list(series.values), np.array(list(series.values.values()))
         reach = np.array([series.reach.low, series.reach.high, series.reach.middle])
