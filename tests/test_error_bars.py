@@ -13,7 +13,7 @@ from mpmcli.error_bars import report
 from mpmcli.error_bars.bars import FLOOR, bars_of
 from mpmcli.error_bars.observables import DENSITY, Map, Observer, Series, read_observed, spread_quantiles
 from mpmcli.error_bars.siblings import CAUSES, NUDGE, LeftOut, Reach, Sibling, siblings_of, tables_of
-from mpmcli.error_bars.study import Plan, Student, Study, chosen_causes
+from mpmcli.error_bars.study import Student, Study, StudyPlan, chosen_causes
 from mpmcli.errors import InputError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
@@ -221,6 +221,8 @@ def test_bad_observables_have_a_sentence(text: str, said: str) -> None:
     with pytest.raises(InputError, match=r"--observe right") as raised:
         read_observed([text], scene_of())
     assert said in str(raised.value)
+    with pytest.raises(InputError, match=r"^a.toml: error_bars.observe: right"):
+        read_observed([text], scene_of(), "a.toml: error_bars.observe:")
 
 
 SCENE = """
@@ -361,4 +363,4 @@ def test_options_that_cannot_be_used_have_a_sentence(tmp_path: Path, words: tupl
 def test_levels_name_their_causes() -> None:
     assert chosen_causes("grids") == ("grid",) and chosen_causes("all") == CAUSES
     assert chosen_causes("grids", only=("step", "grid"), skip=("grid",)) == ("step",)
-    assert Plan().cost(2) == pytest.approx(0.48, abs=0.01) and Plan().cost(3) == pytest.approx(0.31, abs=0.01)
+    assert StudyPlan().cost(2) == pytest.approx(0.48, abs=0.01) and StudyPlan().cost(3) == pytest.approx(0.31, abs=0.01)

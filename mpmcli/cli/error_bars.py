@@ -13,7 +13,7 @@ from mpmcli.errors import InputError
 from mpmcli.plain_text import counted, duration_text
 
 if TYPE_CHECKING:
-    from mpmcli.error_bars.study import Plan, Study
+    from mpmcli.error_bars.study import Study, StudyPlan
     from mpmcli.output.result import Result
     from mpmcli.scene import LoadedScene
 
@@ -39,11 +39,11 @@ def bar_options(command: Callable) -> Callable:
     return command
 
 
-def plan_for(loaded: "LoadedScene", directory: Path | None, asked: dict[str, Any]) -> "Plan":
+def plan_for(loaded: "LoadedScene", directory: Path | None, asked: dict[str, Any]) -> "StudyPlan":
     """Return the plan by the options and the table error_bars of a scene; InputError: they cannot be used."""
     from mpmcli.error_bars.observables import read_observed
     from mpmcli.error_bars.siblings import CAUSES
-    from mpmcli.error_bars.study import Plan, chosen_causes
+    from mpmcli.error_bars.study import StudyPlan, chosen_causes
     from mpmcli.scene.schema import ErrorBars
 
     table = loaded.scene.error_bars or ErrorBars()
@@ -53,13 +53,14 @@ def plan_for(loaded: "LoadedScene", directory: Path | None, asked: dict[str, Any
     if asked.get("budget") and (asked.get("bar_level") or asked.get("only") or asked.get("skip")):
         raise InputError("--budget chooses the level: give it without --level, --only and --skip.")
     causes = chosen_causes(asked.get("bar_level") or table.level, asked.get("only", ()), asked.get("skip", ()))
-    texts = (*(f"{name}={text}" for name, text in table.observe.items()), *asked.get("observe", ()))
-    observed = read_observed(texts, loaded.scene)
+    stated = [f"{name}={text}" for name, text in table.observe.items()]
+    observed = read_observed(stated, loaded.scene, f"{loaded.source}: error_bars.observe:")
+    observed |= read_observed(asked.get("observe", ()), loaded.scene)
     device = {"arch": asked.get("arch", "auto"), "threads": asked.get("threads")}
-    return Plan(causes, int(asked.get("confidence") or table.confidence), observed, directory, **device)
+    return StudyPlan(causes, int(asked.get("confidence") or table.confidence), observed, directory, **device)
 
 
-def within_budget(plan: "Plan", dimension: int, seconds: float, runs: float, budget: float) -> "Plan":
+def within_budget(plan: "StudyPlan", dimension: int, seconds: float, runs: float, budget: float) -> "StudyPlan":
     """Return the plan with the level that fits a budget, s, if a run takes some seconds, of which `runs` are needed."""
     from dataclasses import replace
 
@@ -78,7 +79,7 @@ def within_budget(plan: "Plan", dimension: int, seconds: float, runs: float, bud
     return fits[-1]
 
 
-def study_result(loaded: "LoadedScene", result: "Result", plan: "Plan", *, quiet: bool) -> "Study":
+def study_result(loaded: "LoadedScene", result: "Result", plan: "StudyPlan", *, quiet: bool) -> "Study":
     """Compute the siblings of a finished result, and write the report beside it."""
     from mpmcli.error_bars.report import write
     from mpmcli.error_bars.study import Student
@@ -162,7 +163,7 @@ def _study_of(path: Path, output: Path | None, asked: dict[str, Any]) -> tuple["
     return study, output
 
 
-def _tell_cost(plan: "Plan", loaded: "LoadedScene", seconds: float, *, quiet: bool) -> None:
+def _tell_cost(plan: "StudyPlan", loaded: "LoadedScene", seconds: float, *, quiet: bool) -> None:
     cost = plan.cost(loaded.scene.dimension)
     if not quiet:
         causes = ", ".join(plan.causes)

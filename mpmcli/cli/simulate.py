@@ -16,7 +16,7 @@ from mpmcli.cli.supervisor import announce
 from mpmcli.errors import InputError, RunError
 
 if TYPE_CHECKING:
-    from mpmcli.error_bars.study import Plan
+    from mpmcli.error_bars.study import StudyPlan
     from mpmcli.scene import LoadedScene
     from mpmcli.simulation.summary import RunSummary
 
@@ -95,7 +95,7 @@ def simulate_command(
     return _with_bars(loaded, summary, plan, as_json, quiet)
 
 
-def _with_bars(loaded: "LoadedScene", summary: "RunSummary", plan: "Plan", as_json: bool, quiet: bool) -> int:
+def _with_bars(loaded: "LoadedScene", summary: "RunSummary", plan: "StudyPlan", as_json: bool, quiet: bool) -> int:
     """Compute the error bars of a finished run, and print them after its summary."""
     from mpmcli.error_bars.report import as_dict, text
     from mpmcli.output import open_result

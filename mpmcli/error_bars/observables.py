@@ -165,19 +165,23 @@ class Observer:
         return {name: float(value) for name, value in found.items()}
 
 
-def read_observed(texts: Iterable[str], scene: Scene) -> dict[str, Expression]:
-    """Read observables "NAME=EXPRESSION" over particles, whose value is the mean by mass; InputError: one is wrong."""
+def read_observed(texts: Iterable[str], scene: Scene, where: str = "--observe") -> dict[str, Expression]:
+    """Read observables "NAME=EXPRESSION" over particles, whose value is the mean by mass.
+
+    Raises:
+        InputError: one is wrong; the sentence begins with `where` it was given.
+    """
     d, found = scene.dimension, {}
     for text in texts:
         name, equals, expression = (part.strip() for part in text.partition("="))
         if not (equals and name.isidentifier()):
-            raise InputError(f"--observe {text}: give NAME=EXPRESSION, such as right=1 if x > 0.5 else 0.")
+            raise InputError(f"{where} {text}: give NAME=EXPRESSION, such as right=1 if x > 0.5 else 0.")
         try:
             parsed = parse(expression, [each for each in NAMES if each == "t" or each[-1] in AXES[:d]])
         except ExpressionError as error:
-            raise InputError(f"--observe {name}: the expression {error}.") from None
+            raise InputError(f"{where} {name}: the expression {error}.") from None
         if not isinstance(parsed, Expression):
-            raise InputError(f"--observe {name}: {expression} is the same for all particles; use x or vx, for example.")
+            raise InputError(f"{where} {name}: {expression} is the same for all particles; use x or vx, for example.")
         found[name] = parsed
     return found
 

@@ -75,7 +75,7 @@ class Study:
 
 
 @dataclass
-class Plan:
+class StudyPlan:
     """What to compute: causes, confidence in percent, observed expressions, and where.
 
     `directory` keeps the series of each run, so that they are not computed twice; None keeps none.
@@ -106,7 +106,7 @@ def chosen_causes(level: Level, only: Sequence[str] = (), skip: Sequence[str] = 
 class Student:
     """Computes the runs of one study in this process, with kernels that are shared."""
 
-    def __init__(self, loaded: LoadedScene, plan: Plan) -> None:
+    def __init__(self, loaded: LoadedScene, plan: StudyPlan) -> None:
         self.plan, self.scene = plan, loaded.scene
         self._folder = Path(loaded.source).parent
         self.tables = tables_of(loaded.scene)
