@@ -44,22 +44,75 @@ def near(surface: Surface, node: np.ndarray, h: float) -> np.ndarray:
     return weights * (surface.depth < surface.distance)
 
 
+def points_of(surface: Surface, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the points and the normals that a surface shows at a node, (n, d)."""
+    shown = weights > 0
+    return (surface.x + surface.depth[:, None] * surface.n)[shown], surface.n[shown]
+
+
+def soft_minimum(
+    surface: Surface,
+    r: np.ndarray,
+    axes: np.ndarray,
+    distance: np.ndarray,
+    h: float,
+    counts: float | np.ndarray = 1.0,
+) -> tuple[float, np.ndarray]:
+    """Return the smooth minimum of distances (n) of the points of a surface, from which r (n, d) lead to a node, m.
+
+    A point counts as farther away, the farther it is from the line through the node along its axis (n, d). Also return
+    the shares of the points, which have these weights.
+    """
+    radius, beta = 3 * h, 12 / surface.distance
+    shares = counts * np.exp(-beta * (distance + ((r**2).sum(1) - (r * axes).sum(1) ** 2) / (2 * radius)))
+    row = (np.sqrt(2 * np.pi * radius / beta) / surface.distance) ** (r.shape[1] - 1)
+    if shares.sum() == 0.0:
+        return np.inf, shares
+    return -np.log(shares.sum() / row) / beta, shares / shares.sum()
+
+
 def distance_to(surface: Surface, weights: np.ndarray, node: np.ndarray, axis: np.ndarray, h: float) -> float:
     """Return the distance of a node from the points of a surface along its outward axis, m."""
-    shown = weights > 0
-    r = node - (surface.x + surface.depth[:, None] * surface.n)[shown]
-    radius, beta = 3 * h, 12 / surface.distance
-    along = r @ axis
-    q = along + ((r**2).sum(1) - along**2) / (2 * radius)
-    row = (np.sqrt(2 * np.pi * radius / beta) / surface.distance) ** (len(axis) - 1)
-    return -np.log(np.exp(-beta * q).sum() / row) / beta
+    r = node - points_of(surface, weights)[0]
+    return soft_minimum(surface, r, np.broadcast_to(axis, r.shape), r @ axis, h)[0]
 
 
-def distance_from(r: np.ndarray, axis: np.ndarray, beta: float, h: float) -> float:
-    """Return the distance of a node from points of an obstacle, from which r (n, d) lead to it, along an axis, m."""
-    along = r @ axis
-    q = along + ((r**2).sum(1) - along**2) / (6 * h)
-    return -np.log(np.exp(-beta * q).sum() / (1 + (len(r) - 1) * np.exp(-beta * h / 6))) / beta
+def facing(n: np.ndarray, others: np.ndarray, low: float, high: float) -> np.ndarray:
+    """Return the weights of points with normals n that meet faces with others, (n, d): they must be opposite."""
+    return np.clip((-(n * others).sum(1) - low) / (high - low), 0.0, 1.0)
+
+
+def between(
+    surfaces: tuple[Surface, Surface], weights: list[np.ndarray], node: np.ndarray, h: float
+) -> tuple[float, np.ndarray, float]:
+    """Return the gap of two bodies, m, the axis from the first to the second, and how far a node is from its middle, m.
+
+    The points of each are taken in the distance of the other, of the plane of the nearest point or, if that one is
+    below the plane of another, by more than 0.1 / beta, the plane that is farther out.
+    """
+    shown = [points_of(surface, w) for surface, w in zip(surfaces, weights, strict=True)]
+    gaps, means, axis = [], [], np.zeros(len(node))
+    for k, sign in ((0, -1), (1, 1)):
+        (y, own), (z, n) = shown[k], shown[1 - k]
+        distances, faces = [], []
+        for point in y:
+            first = int(np.argmin(((point - z) ** 2).sum(1)))
+            off = ((point - z) * n).sum(1)
+            edge = ((z[first] - z) * n).sum(1) < -0.1 * surfaces[1 - k].distance / 12
+            best = int(np.argmax(np.where(edge, off, -np.inf)))
+            chosen = best if edge[best] and off[best] > off[first] else first
+            distances.append(off[chosen])
+            faces.append(n[chosen])
+        counts = facing(own, np.array(faces), 0.3, 0.6)
+        gap, shares = soft_minimum(surfaces[k], node - y, np.array(faces), np.array(distances), h, counts)
+        gaps.append(gap)
+        means.append(-sign * (shares @ (node - y)))
+        axis += sign * (shares @ np.array(faces))
+    if not np.isfinite(gaps).any():
+        return np.inf, axis, 0.0
+    axis = unit(axis)
+    far = [sign * (mean @ axis - min(gaps) / 2) for sign, mean in zip((1, -1), means, strict=True)]
+    return min(gaps), axis, float(np.mean([one for one, gap in zip(far, gaps, strict=True) if np.isfinite(gap)]))
 
 
 def normal_along(surface: Surface, weights: np.ndarray, axis: np.ndarray) -> np.ndarray:
@@ -77,19 +130,6 @@ class Obstacle:
     normal: Callable[[np.ndarray], np.ndarray]
     velocity: Callable[[np.ndarray], np.ndarray]
     friction: float
-
-    def points(self, node: np.ndarray, h: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return points on it, the nearest one and those nearest to places a cell aside, and the normals there."""
-
-        def nearest(x: np.ndarray) -> np.ndarray:
-            return x - self.distance(x) * self.normal(x)
-
-        n, first = self.normal(node), nearest(node)
-        least = int(np.argmin(np.abs(n)))
-        tangents = [np.array([-n[1], n[0]])] if len(n) == 2 else [unit(np.eye(3)[least] - n[least] * n)]
-        tangents += [np.cross(n, tangents[0])] if len(n) == 3 else []
-        places = [node, *(first + side * h * t for t in tangents for side in (-1, 1))]
-        return np.array([nearest(x) for x in places]), np.array([self.normal(x) for x in places])
 
 
 def exchange(
@@ -113,21 +153,22 @@ def exchange(
             continue
         n_a, n_c = (unit(weights @ surface.n) for weights, surface in zip(w, surfaces, strict=True))
 
-        def far(axis: np.ndarray, w: list = w, node: np.ndarray = node) -> tuple[float, float]:
-            return distance_to(a, w[0], node, axis, h), distance_to(c, w[1], node, -axis, h)
-
         if n_a @ n_c >= 0.7:
             continue
-        mean = unit(n_a - n_c)
-        axes = [normal_along(a, w[0], -n_c), -normal_along(c, w[1], -n_a), mean]
-        if axes[0] @ axes[1] > 0.999:
-            axes = [unit(axes[0] + axes[1])]
+        faces = normal_along(a, w[0], -n_c), -normal_along(c, w[1], -n_a)
+        gap, n, middle = between((a, c), w, node, h) if faces[0] @ faces[1] < 0.999 else (np.inf, np.zeros(0), 0.0)
+        ways = gap / 2 + middle, gap / 2 - middle
+        if not np.isfinite(gap):
+            if faces[0] @ faces[1] <= 0.15:
+                continue
+            n = unit(faces[0] + faces[1])
+            ways = distance_to(a, w[0], node, n, h), distance_to(c, w[1], node, -n, h)
         u = momenta[1][at] / m[1] - momenta[0][at] / m[0]
         inverse = 1 / a.modulus + 1 / c.modulus, (a.density, c.density)
         slopes = np.array(
             [weights @ surface.slope / weights.sum() for surface, weights in zip(surfaces, w, strict=True)]
         )
-        J = impulse(axes, far, u, slopes, m[0] * m[1] / m.sum(), inverse, h, dt, friction)
+        J = impulse(n, ways, u, slopes, m[0] * m[1] / m.sum(), inverse, h, dt, friction)
         momenta[0][at] -= J
         momenta[1][at] += J
         pushed += (J != 0).any()
@@ -150,37 +191,56 @@ def stop(
         D = obstacle.distance(node)
         if mass[at] == 0 or 1.5 * h <= D:
             continue
-        w, facing = near(surface, node, h), obstacle.normal(node)
-        u = obstacle.velocity(node - D * facing) - gravity_step - momentum[at] / mass[at]
-        if not shows(surface, w) or unit(w @ surface.n) @ facing >= 0.7:
+        w, inwards = near(surface, node, h), obstacle.normal(node)
+        u = obstacle.velocity(node - D * inwards) - gravity_step - momentum[at] / mass[at]
+        push, n, far, seen = springs(surface, w, obstacle, node, h, u, mass[at], dt)
+        if not seen:
             # Behind the obstacle what shows no surface is stopped.
-            push = mass[at] * max(0.0, u @ facing) * (D <= 0)
-            along = u - (u @ facing) * facing
-            slip = np.linalg.norm(along)
-            J = -push * facing - min(obstacle.friction * push, mass[at] * slip) * along / slip
-            momentum[at] -= J
-            taken += J
-            continue
-
-        points, normals = obstacle.points(node, h)
-
-        def far(axis: np.ndarray, w: np.ndarray = w, node: np.ndarray = node, r: np.ndarray = node - points) -> tuple:
-            return distance_to(surface, w, node, axis, h), distance_from(r, -axis, 12 / surface.distance, h)
-
-        n = unit(w @ surface.n)
-        shares = np.exp(16 * (-normals @ n - 1))
-        slopes = np.array([w @ surface.slope / w.sum(), np.zeros(len(node))])
-        inverse = 1 / surface.modulus, (surface.density,)
-        axes = [normal_along(surface, w, -facing), -unit(shares @ normals), unit(n - facing)]
-        if (normals @ facing > 0.9).all():
-            axes = [-facing]
-        elif axes[0] @ axes[1] > 0.999:
-            axes = [unit(axes[0] + axes[1])]
-        J = impulse(axes, far, u, slopes, mass[at], inverse, h, dt, obstacle.friction)
+            push, n, far = mass[at] * max(0.0, u @ inwards) * (D <= 0), -inwards, 0.0
+        along = u + (far * (w @ surface.slope / w.sum()) if seen else 0.0)
+        along -= (along @ n) * n
+        slip = np.linalg.norm(along)
+        J = push * n - min(obstacle.friction * push, mass[at] * slip) * along / slip if push > 0.0 else np.zeros(len(n))
         momentum[at] -= J
         taken += J
-        pushed += (J != 0).any()
+        pushed += seen and (J != 0).any()
     return pushed, taken
+
+
+def springs(
+    surface: Surface,
+    weights: np.ndarray,
+    obstacle: Obstacle,
+    node: np.ndarray,
+    h: float,
+    u: np.ndarray,
+    mass: float,
+    dt: float,
+) -> tuple[float, np.ndarray, float, bool]:
+    """Return the push of a node, N s, its axis, the distance of the node from the body, m, and if it shows a surface.
+
+    The points y of the surface inside the obstacle have springs; a node moves them with w (1 + 4 r (y - x) / h^2).
+    """
+    none = 0.0, np.zeros(len(node)), 0.0
+    if not shows(surface, weights):
+        return *none, False
+    y, _ = points_of(surface, weights)
+    x = surface.x[weights > 0]
+    normals, D = (np.array([f(place) for place in y]) for f in (obstacle.normal, obstacle.distance))
+    inside = D < 0
+    if not inside.any():
+        return *none, True
+    shares = weights[weights > 0] * (1 + 4 * ((node - x) * (y - x)).sum(1) / h**2)
+    shares = shares[inside] * surface.distance ** (len(node) - 1)
+    forces = -shares * D[inside]
+    total = -forces @ normals[inside]
+    area, n = np.abs(shares).sum(), unit(total)
+    kappa = 2 * surface.modulus / h * area * dt**2 / mass
+    away, overlap = u @ n, np.linalg.norm(total) / area
+    push = max(0.0, overlap / dt - away / 2) * kappa / (1 + kappa / 2)
+    push = mass * max(push, -away * np.clip((overlap / h - 0.1) / 0.1, 0, 1))
+    far = (np.abs(forces) @ (node - y)[inside]) @ n / np.abs(forces).sum()
+    return push, n, far, True
 
 
 def shows(surface: Surface, weights: np.ndarray) -> bool:
@@ -198,8 +258,8 @@ def beyond(r: float, density: Callable[[float], float]) -> float:
 
 
 def impulse(
-    axes: list[np.ndarray],
-    far: Callable,
+    n: np.ndarray,
+    ways: tuple[float, float],
     u: np.ndarray,
     slopes: np.ndarray,
     reduced: float,
@@ -208,14 +268,12 @@ def impulse(
     dt: float,
     friction: float,
 ) -> np.ndarray:
-    """Return the impulse along the best axis.
+    """Return the impulse along an axis, along which the surfaces of both have these distances from the node.
 
     slopes: dv/dn of both, a row each; inverse: of the modulus, summed over both, and the densities.
     """
     d = len(u)
-    gaps = np.array([sum(far(axis)) for axis in axes])
-    n = unit(np.exp((gaps - gaps.max()) / (0.02 * h)) @ np.array(axes))
-    far_a, far_c = far(n)
+    far_a, far_c = ways
     flat = [density * beyond(far_ / h, quadratic) for density, far_ in zip(inverse[1], (far_a, far_c), strict=False)]
     share = min(1.0, reduced * sum(1 / max(one, 1e-30) for one in flat) / h**d)
     # The force 4 w(r) r of a uniform stress behind the surface.

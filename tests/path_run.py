@@ -79,6 +79,7 @@ def scene_of(dimension: int, precision: str) -> Scene:
         "solver": {"precision": precision},
         "output": {"fields": ["velocity", "volume_ratio", "affine", "deformation_gradient"]},
         "bodies": bodies,
+        "contact": {"default": "stick"},
     }
     return parse_scene(data, laws=parameter_models()).scene
 

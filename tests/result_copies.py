@@ -39,6 +39,8 @@ name = "ball"
 material = { law = "neo_hookean", density = 700.0, youngs_modulus = 1e5, poissons_ratio = 0.3 }
 shape = { ball = { center = [1.0, 0.7], radius = 0.15 } }
 velocity = [0.3, 0.0]
+[contact]
+default = "stick"
 [output]
 fields = ["velocity", "density", "volume_ratio", "mass", "affine"]
 """

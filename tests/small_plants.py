@@ -224,9 +224,15 @@ CONTACT = _of(
     "solver/contact/body_contact.py",
     ("rub = ti.min(friction * push", "rub = ti.min(1.05 * friction * push", "slope_contact"),
     ("along = u + aside", "along = u + 0.0 * aside", "rolling_contact"),
-    # Mean normals, which tilt beside edges; no separating axis; the places of particles in place of their surface.
-    ("normal[b] = axes[0, b] + axes[1, b]", "normal[b] = 1.0 * normal[b]", "slope_contact"),
-    ("if alike < SAME:", "if alike < -SAME:", "rolling_contact slope_contact"),
+    # Mean normals, which tilt beside edges; all faces taken as parallel; the places of particles in place of their
+    # surface.
+    ("normal[b] = faces[0, b] + faces[1, b]", "normal[b] = n_a[b] - n_c[b]", "slope_contact"),
+    (
+        "if alike < SAME:",
+        "if alike < -SAME:",
+        "rolling_contact slope_contact",
+        "no case presses the edge of a body into another; tests/test_wall_contact.py does",
+    ),
     ("way[b] -= depth * n[b]", "way[b] -= 0.0 * depth * n[b]", "two_disks_contact"),
 )
 SMALL_PLANTS = (*TRANSFERS, *DRIVES, *WALLS, *CONTACT, *ELASTIC, *FLUIDS, *PLASTIC)

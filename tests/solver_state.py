@@ -42,8 +42,8 @@ class BodyState:
 
 
 def scene_of(**tables: object) -> Scene:
-    """Return the scene of these tables."""
-    return parse_scene(tables, laws=parameter_models()).scene
+    """Return the scene of these tables; bodies share one velocity field, unless `contact` is given."""
+    return parse_scene({"contact": {"default": "stick"}} | tables, laws=parameter_models()).scene
 
 
 def with_colliders(scene: Scene, colliders: list[dict]) -> Scene:

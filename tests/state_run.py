@@ -86,6 +86,7 @@ def scene_named(name: str) -> Scene:
         "domain": {"size": [1.0] * d, "cells": [20 if d == 2 else 12] * d, "gravity": [0.0, -9.81, 0.0][:d]},
         "time": {"end": 1.0, "frames": 1},
         "bodies": bodies,
+        "contact": {"default": "stick"},
         **more,
     }
     return parse_scene(data, laws=parameter_models(), source=name).scene

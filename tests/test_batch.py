@@ -150,6 +150,7 @@ def scene_named(name: str, other: bool = False) -> Scene:
         "forces": [{"acceleration": a} | ({"body": body} if body else {}) for body, a in forces],
         "solver": more.get("solver", {}),
     }
+    data["contact"] = {"default": "stick"}
     if "contact" in more:
         data["contact"] = {"default": "separate", "friction": more["contact"] + 0.1 * other}
     scene = parse_scene(data, laws=parameter_models(), source=name).scene

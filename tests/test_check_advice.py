@@ -50,8 +50,8 @@ SCENES = {
     "a jelly on a post": (DROP + collider("post", (0.45, 0.0), (0.55, 0.2)), set(), {"stand-off"}),
     "two jellies": (
         DROP + body("jelly", (0.4, 0.6), (0.6, 0.8)).replace('name = "jelly"', 'name = "b"'),
-        {"contact"},
         set(),
+        {"contact"},
     ),
     "a beam that is held": (
         body("rubber", (0.0, 0.45), (0.5, 0.55)) + collider("grip", (0.0, 0.4), (0.1, 0.6), 'wall = "hold"'),

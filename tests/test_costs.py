@@ -56,11 +56,12 @@ def test_a_step_costs_as_many_particles_as_there_are(d: int) -> None:
 
 def test_what_stands_beside_costs_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    plain = cost_of(load(GOOD).scene, "most")
-    for text in (GOOD + JET, GOOD + POST, GOOD + POST + "density = 1000.0\n"):
+    alike = GOOD + '[contact]\ndefault = "stick"\n'
+    plain = cost_of(load(alike).scene, "most")
+    for text in (alike + JET, alike + POST, alike + POST + "density = 1000.0\n"):
         cost = cost_of(load(text).scene, "most")
         assert cost.compile > plain.compile and cost.step > 0.9 * plain.step
-    cubic = load(GOOD + '[solver]\nkernel = "cubic"\n')
+    cubic = load(alike + '[solver]\nkernel = "cubic"\n')
     assert cost_of(cubic.scene, "most").step == pytest.approx(plain.step * 16 / 9)
 
 

@@ -144,6 +144,7 @@ def test_forces_of_joined_frames_are_means_over_their_time(tmp_path: Path) -> No
             collider_torque=((force,), (2.0,)),
             contact_torque=((force,),),
             contact_overlap=0.1 * force % 0.4,
+            contact_work=force,
         )
         for time, force in ((0.1, 1.0), (0.4, 3.0), (0.5, 5.0))
     ]
@@ -152,7 +153,8 @@ def test_forces_of_joined_frames_are_means_over_their_time(tmp_path: Path) -> No
     assert np.allclose(joined.collider_force, ((mean, 1.0), (0.0, mean)), rtol=1e-15)
     assert np.allclose(joined.collider_torque, ((mean,), (2.0,)), rtol=1e-15)
     assert np.allclose(joined.contact_torque, ((mean,),), rtol=1e-15)
-    assert joined.contact_overlap == pytest.approx(0.3) and joined.contact_gap is None
+    assert joined.contact_overlap == pytest.approx(0.3) and joined.contact_work == 9.0
+    assert joined.contact_gap is None
 
 
 def test_walls_inside_of_others_have_no_particles(tmp_path: Path) -> None:

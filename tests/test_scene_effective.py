@@ -163,7 +163,7 @@ tension_cutoff = true
 volume_correction = true
 
 [contact]
-default = "stick"
+default = "auto"
 pairs = []
 
 [output]

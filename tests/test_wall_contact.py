@@ -2,14 +2,17 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from contact_scenes import DENSITY, E, G, H, body, jelly, scene
 
-from mpmcli.check.result_check import CONTACT_SUSPECT, energy_change
+from mpmcli.check.result_check import HELD, check_kept, energy_change
 from mpmcli.frames.frame import Frame
-from mpmcli.scene import Scene
+from mpmcli.materials.registry import laws
+from mpmcli.output.header import RunHeader
+from mpmcli.scene import Scene, scene_to_toml
 from mpmcli.solver.contact.surfaces import BELOW_ALL
 from mpmcli.solver.engine.run import build_run
 
@@ -196,7 +199,7 @@ def test_a_mirror_image_does_the_same_and_half_the_step_nearly(backend_of: Calla
     assert speed[0] < 0
     assert image == pytest.approx(place * [-1, 1] + [64 * H, 0], abs=1e-9)
     assert its_speed == pytest.approx(speed * [-1, 1], abs=1e-8)
-    assert half == pytest.approx(place, abs=0.15 * H)
+    assert half == pytest.approx(place, abs=0.3 * H)
 
 
 def test_jelly_stays_out_of_a_wedge(backend_of: Callable) -> None:
@@ -212,13 +215,81 @@ def test_jelly_stays_out_of_a_wedge(backend_of: Callable) -> None:
     assert min(frame.position[:, 1].min() for frame in frames) < 11.5 * H
 
 
+def on_an_edge(way: str, friction: float, youngs_modulus: float, shift: float) -> Scene:
+    """A block of 16 cells that falls on a narrower post, its edge, a wedge or a ball, "shift" cells off the grid."""
+    place = 26.0 + 32 * ["post", "wedge", "ball"].index(way) if way != "edge" else 33.0
+    low = [place - 4, 10.5 if way == "post" else 10.2]
+    block = body(
+        "block",
+        [x + shift for x in low],
+        [x + 16 + shift for x in low],
+        material=jelly(youngs_modulus=youngs_modulus),
+    )
+    corners = np.array([[50.0, 0.0], [74.0, 0.0], [62.0, 10.0]])
+    shapes = {
+        "post": {"box": {"min": [(26 + shift) * H, -2 * H], "max": [(34 + shift) * H, (10 + shift) * H]}},
+        "wedge": {"polygon": {"vertices": ((corners + shift) * H).tolist()}},
+        "ball": {"ball": {"center": [(94 + shift) * H, (2 + shift) * H], "radius": 8 * H}},
+    }
+    colliders = [{"name": name, "shape": shape, "friction": friction} for name, shape in shapes.items()]
+    tables = {"gravity": [0.0, -G], "size": [128 * H, 48 * H]}
+    # From the edge it tips.
+    end = 0.45 if way == "edge" else 1.0
+    return scene([block], end=end, frames=50, domain=tables, colliders=colliders)
+
+
+@pytest.mark.parametrize(
+    "how",
+    [
+        ("post", 0.5, E, 0.0),
+        ("post", 0.0, 30 * E, 0.3),
+        ("wedge", 0.0, 30 * E, 0.0),
+        ("ball", 0.5, 30 * E, 0.3),
+        ("edge", 0.5, E, 0.3),
+    ],
+)
+def test_an_obstacle_makes_no_energy(backend_of: Callable, how: tuple) -> None:
+    """Neither does contact give more than it has taken, at any time."""
+    rows = [row for _, row in build_run(on_an_edge(*how), backend_of("f64", 1)).frames()]
+    energy, work = np.array([row.energy for row in rows]), np.cumsum([row.contact_work for row in rows])
+    turned = max(row.kinetic + row.elastic for row in rows)
+    assert (energy - energy[0]).max() < 1e-6 * turned and work.max() < 1e-6 * turned
+    assert np.ptp(energy) > 1e-2 * turned and work.min() < -1e-3 * turned
+
+
+def test_contact_that_makes_energy_is_found(backend_of: Callable) -> None:
+    """A tenth of the energy turned over, in the swings after the first contact."""
+    asked = on_an_edge("post", 0.5, E, 0.0)
+    run = build_run(asked, backend_of("f64", 1))
+    frames, rows = zip(*run.frames(), strict=True)
+    header = RunHeader.of(asked, scene_to_toml(asked), [laws()[name] for name in run.laws], {"precision": "f64"})
+    turned = max(row.kinetic + row.elastic for row in rows)
+    for made, found in ((0.0, set()), (0.1, {"energy"})):
+        more = [replace(row, elastic=row.elastic + made * turned * min(2 * row.time, 1.0)) for row in rows]
+        assert {"energy"} & {finding.rule for finding in check_kept(header, frames, more).findings} == found
+
+
+def test_an_edge_of_a_body_makes_no_energy(backend_of: Callable) -> None:
+    """A soft block falls on a post half as wide, and swings there ever less."""
+    post = body("post", [26, 0], [34, 10], material=jelly(youngs_modulus=10 * E))
+    asked = scene([body("block", [22, 10], [38, 26]), post], 0.5, end=1.8, frames=90, domain={"gravity": [0.0, -G]})
+    rows = [row for _, row in build_run(asked, backend_of("f64", 1)).frames()]
+    energy = np.array([row.energy for row in rows]) - rows[0].energy
+    turned = max(row.kinetic + row.elastic for row in rows)
+    assert energy.max() < 1e-3 * turned
+    assert energy[-30:].max() < 0.0
+
+
 def test_the_ledger_lacks_a_part_of_the_energy_of_contact(backend_of: Callable) -> None:
-    """What it seems to gain while a block of 10 cells swings on a floor is less than `check` allows for contact."""
+    """A block of 10 cells that swings on a floor seems to gain it; without the work of contact nothing is gained."""
     block = body("block", [10, 0], [25, 10])
     asked = scene([block], end=0.5, frames=50, domain={"walls": "separate", "friction": 0.3, "gravity": [0.0, -G]})
     rows = [row for _, row in build_run(asked, backend_of("f64", 1)).frames()]
-    parts = (np.array([getattr(row, name) for row in rows]) for name in ("kinetic", "potential", "elastic"))
-    assert energy_change(*parts)[0].max() < 0.8 * CONTACT_SUSPECT
+    parts = [np.array([getattr(row, name) for row in rows]) for name in ("kinetic", "potential", "elastic")]
+    work = np.cumsum([row.contact_work for row in rows])
+    assert 1e-2 < energy_change(*parts)[0].max() < 0.8 * HELD
+    assert energy_change(*parts, work)[0].max() < 1e-3
+    assert work.min() < 0.0 and work.max() < 1e-3 * np.ptp(parts[2])
 
 
 @pytest.mark.parametrize("way", ["wall", pytest.param("plane", marks=pytest.mark.slow)])
@@ -267,7 +338,7 @@ def test_a_tower_of_five_cubes_stands(backend_of: Callable) -> None:
     low = np.array([[20 + 0.15 * (-1) ** k, 10 * k] for k in range(5)])
     frames = list(build_run(piled(low, np.full((5, 2), 10), 1e6, 5.0), backend_of("f32")).frames())
     moved = middles(frames[-1][0]) - middles(frames[0][0])
-    assert np.abs(moved[:, 0]).max() < 0.15
+    assert np.abs(moved[:, 0]).max() < 0.2
     assert -1.3 * 300 * G * (50 * H) ** 2 / 2e6 / H < moved[-1, 1] < 0.0
 
 

@@ -67,13 +67,18 @@ class Loads:
     @ti.func
     def take(self, run: int, node: ti.template(), k: int, impulse: ti.template(), arm: ti.template()):
         """Add an impulse at a node, N s, to the loads of receiver k, with the arm from its point of reference, m."""
-        place = (run * self.rows + self.row_of(node)) * self.capacity + k
         load = self.of(impulse, arm)
         for a in ti.static(range(self.width)):
-            if ti.static(self.on_cpu):
-                self.taken[place][a] = self.taken[place][a] + ti.cast(load[a], ti.f64)
-            else:
-                ti.atomic_add(self.taken[place][a], load[a])
+            self.add(run, node, k, a, load[a])
+
+    @ti.func
+    def add(self, run: int, node: ti.template(), k: int, a: ti.template(), value: float):
+        """Add a value from a node to the a-th number of receiver k."""
+        place = (run * self.rows + self.row_of(node)) * self.capacity + k
+        if ti.static(self.on_cpu):
+            self.taken[place][a] = self.taken[place][a] + ti.cast(value, ti.f64)
+        else:
+            ti.atomic_add(self.taken[place][a], value)
 
     @ti.func
     def of(self, impulse: ti.template(), arm: ti.template()):

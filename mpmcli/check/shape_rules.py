@@ -29,6 +29,8 @@ from mpmcli.scene.surface import form_surface, surface_points
 FEWEST_CELLS = 3.0
 # Distance, in cells, below which two particles always share a node, by kernel.
 REACH = {"quadratic": 2.0, "cubic": 3.0}
+# Laws of solids without a surface of their own.
+WELDING = ("snow", "von_mises")
 # Distance, in cells, below which a gap counts as intended contact.
 TOUCHING = 0.1
 # Distance, in cells, below which a wall acts on a body.
@@ -55,7 +57,7 @@ POINTS, INSTANTS = {2: 96, 3: 32}, 33
 
 def shape_findings(facts: SceneFacts) -> Iterator[Finding]:
     """Yield the findings on shapes and their particles."""
-    for rule in (_thin, _gaps, _sticking, _walls, _particles, _stretched, _pulled):
+    for rule in (_thin, _gaps, _sticking, _welding, _walls, _particles, _stretched, _pulled):
         yield from rule(facts)
 
 
@@ -97,17 +99,32 @@ def _sticking(facts: SceneFacts) -> Iterator[Finding]:
     """Yield elastic bodies that stick although they could separate, in a scene that does not set contact."""
     scene = facts.scene
     elastic = [source.name for source in scene.sources if source.has_surface]
-    given = scene.contact.pairs or "default" in scene.contact.model_fields_set
-    shared = scene.solver.solids == "total" or scene.solver.grid == "sparse"
-    shared = shared or any(collider.free for collider in scene.colliders)
-    if len(elastic) > 1 and not given and not shared:
-        reach = REACH[scene.solver.kernel]
-        what = (
-            f"The elastic bodies {several(quoted(elastic))} share one velocity field: they act on each other within "
-            f"{reach:g} cells, and do not slide on each other."
-        )
-        fix = 'Set contact.default = "separate" to resolve contact at their surfaces, or "stick" to keep this.'
-        yield Finding("note", "contact", what, fix, len(elastic), elastic[0])
+    if not elastic or scene.contact.default != "auto" or scene.parts or scene.contact.pairs:
+        return
+    reach = REACH[scene.solver.kernel]
+    if len(elastic) > 1:
+        how = f"share one velocity field: they act on each other within {reach:g} cells, and do not slide on each other"
+        if scene.solver.solids == "total":
+            how = "meet a quarter of a cell early, and slide on each other without friction"
+        what = f"With {scene.one_field} the elastic bodies {several(quoted(elastic))} {how}."
+        yield Finding("note", "contact", what, "Change this to resolve contact at their surfaces.", len(elastic))
+        return
+    domain, d = scene.domain, scene.dimension
+    faces = zip(domain.walls.faces(d), domain.frictions, strict=True)
+    rough = any(word == "separate" and mu > 0 for words, own in faces for word, mu in zip(words, own, strict=True))
+    rough = rough or any(one.wall == "separate" and one.friction > 0 for one in scene.colliders)
+    if rough and not scene.one_field:
+        what = f'Body "{elastic[0]}" is alone, so that it does not meet walls and colliders at its surface, nor rolls.'
+        fix = 'Set contact.default = "separate" if it slides or rolls on them.'
+        yield Finding("note", "contact", what, fix, 1, elastic[0])
+
+
+def _welding(facts: SceneFacts) -> Iterator[Finding]:
+    """Yield solids that weld on contact, because those that yield share one velocity field with all others."""
+    yielding = [one.name for one in facts.scene.sources if one.material.law in WELDING]
+    if yielding and len(yielding) + sum(one.has_surface for one in facts.scene.sources) > 1:
+        what = f"The material of {several(quoted(yielding))} yields: solids that it meets weld to it, and do not slide."
+        yield Finding("note", "weld", what, "Nothing needs to be done.", len(yielding), yielding[0])
 
 
 def _walls(facts: SceneFacts) -> Iterator[Finding]:

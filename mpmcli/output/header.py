@@ -82,16 +82,6 @@ class _Body(_Facts):
             return None
 
 
-class _Contact(_Facts):
-    default: str = "stick"
-    pairs: tuple[dict[str, Any], ...] = ()
-
-    @property
-    def separates(self) -> bool:
-        """Whether elastic bodies may separate."""
-        return self.default == "separate" or any(pair.get("friction") != "stick" for pair in self.pairs)
-
-
 class _StoredScene(_Facts):
     """The entries of a complete scene that are read; the file of a shape may be gone."""
 
@@ -105,7 +95,6 @@ class _StoredScene(_Facts):
     colliders: tuple[dict[str, Any], ...] = ()
     forces: tuple[Any, ...] = ()
     impulses: tuple[Any, ...] = ()
-    contact: _Contact = _Contact()
 
 
 class LawHeader(_Facts):

@@ -143,12 +143,14 @@ class ContactPair(Table):
 class Contact(Table):
     """Contact between bodies."""
 
-    default: Literal["stick", "separate"] = Field(
-        "stick",
-        description='"stick": bodies share one velocity field, meet up to two cells before they touch, and do not '
-        'slide. "separate": each elastic body has a velocity field of its own; they meet each other, and walls and '
-        "colliders that separate, where their surfaces are, slide with friction, and part. Liquids, grains and bodies "
-        "that yield stick to all others.",
+    default: Literal["auto", "stick", "separate"] = Field(
+        "auto",
+        description='"separate": each elastic body has a velocity field of its own; they meet each other, and walls '
+        "and colliders that separate, where their surfaces are, slide with friction, and part. Liquids, grains and "
+        'bodies that yield stick to all others. "stick": bodies share one velocity field, meet up to two cells before '
+        'they touch, and do not slide. "auto": "separate" with several elastic bodies, or with one among others and '
+        "walls or colliders that separate, unless settings of the solver or rigid bodies exclude it; otherwise "
+        '"stick".',
     )
     friction: NotNegative | None = Field(
         None, description="Coefficient of Coulomb friction. Default: the softer body's, `surface_friction`."

@@ -1,5 +1,6 @@
 """The tables of a scene: one frozen model per table, each key with its unit, range and default."""
 
+import math
 from functools import lru_cache
 from typing import Annotated, Any, ClassVar, Literal, Union, get_args
 
@@ -20,6 +21,10 @@ from mpmcli.scene.forces import Contact, Force, Impulse
 from mpmcli.scene.material import MaterialParameters
 from mpmcli.scene.quantity import NAME, Flag, Integer, NotNegative, Positive, Table, Vector, flaw, scene_dimension
 from mpmcli.scene.shapes import OneShape
+
+# A node stores the numbers of the velocity fields with mass in bytes of one integer; of more than eight, the first are
+# lost. And the largest number of nodes of all fields with contact.default = "auto", which take 1 GB in 3D.
+MOST_FIELDS, MOST_NODES = 255, 2**26
 
 
 def usual_particles_per_cell(dimension: int) -> int:
@@ -188,7 +193,7 @@ class SolverSettings(Table):
     deterministic: Flag = Field(
         False,
         description="Whether a GPU adds in fixed point, so that two runs have the same bytes. On the CPU they have "
-        "them in any case, and nothing changes.",
+        "them in any case, and nothing changes but contact.default.",
     )
 
 
@@ -351,7 +356,7 @@ class Scene(Table):
     impulses: tuple[Impulse, ...] = Field(
         (), description="Pushes on particles near a place, at a time or over an interval."
     )
-    contact: Contact = Field(Contact(), description="Contact between bodies. Default: they stick.")
+    contact: Contact = Field(Contact(), description='Contact between bodies. Default: "auto".')
     output: Output = Field(Output(), description="Stored fields and format.")
     error_bars: ErrorBars | None = Field(None, description="Error bars after the run. Default: none.")
     solver: SolverSettings = Field(SolverSettings(), description="Numerical method.")
@@ -372,7 +377,7 @@ class Scene(Table):
         for pair in self.contact.pairs:
             if set(pair.between) == {first.name, second.name}:
                 return None if pair.friction == "stick" else pair.friction
-        if self.contact.default != "separate" or not (first.has_surface and second.has_surface):
+        if not (self.parts and first.has_surface and second.has_surface):
             return None
         if self.contact.friction is not None:
             return self.contact.friction
@@ -380,10 +385,34 @@ class Scene(Table):
         materials = (first.material, second.material)
         return min((own.shear_modulus, getattr(own, "surface_friction", 0.0)) for own in materials)[1]
 
+    @property
+    def parts(self) -> bool:
+        """Whether elastic bodies separate that are not in `contact.pairs`."""
+        if self.contact.default != "auto":
+            return self.contact.default == "separate"
+        elastic, others = sum(source.has_surface for source in self.sources), len(self.sources) > 1
+        faces = (word for pair in self.domain.walls.faces(self.dimension) for word in pair)
+        obstacles = "separate" in faces or any(collider.wall == "separate" for collider in self.colliders)
+        return (elastic > 1 or (elastic == 1 and others and obstacles)) and not self.one_field
+
+    @property
+    def one_field(self) -> str:
+        """What makes all bodies share one velocity field, a setting or their number; "" if nothing does."""
+        solver = self.solver
+        fields = 1 + sum(source.has_surface for source in self.sources)
+        found = {
+            'solver.solids = "total"': solver.solids == "total",
+            'solver.grid = "sparse"': solver.grid == "sparse",
+            "solver.deterministic = true": solver.deterministic,
+            "rigid bodies": any(collider.free for collider in self.colliders),
+            "so many bodies": fields > MOST_FIELDS or fields * math.prod(self.domain.cells) > MOST_NODES,
+        }
+        return next((setting for setting, given in found.items() if given), "")
+
     def separates(self, source: "Body | Emitter") -> bool:
         """Return whether a body has its own velocity field: contact is then resolved at its surface."""
         named = any(source.name in pair.between and pair.friction != "stick" for pair in self.contact.pairs)
-        return source.has_surface and (named or self.contact.default == "separate")
+        return source.has_surface and (named or self.parts)
 
     @property
     def contact_pairs(self) -> tuple[tuple[str, str], ...]:

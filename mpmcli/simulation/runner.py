@@ -11,6 +11,7 @@ from mpmcli.frames.ledger import LedgerRow
 from mpmcli.materials.registry import laws
 from mpmcli.output.header import RunHeader
 from mpmcli.scene import BodyParticles, Scene, sample_bodies, scene_to_toml
+from mpmcli.solver.contact.layers import Layers
 from mpmcli.solver.engine.batch import Batch
 from mpmcli.solver.engine.compiled_kind import CompiledKind
 from mpmcli.solver.engine.run import Run, build_run, frames_of_all, suits_batch
@@ -220,7 +221,8 @@ class Runner:
                 yield place, recorders[place].stopped(event) if isinstance(event, UnstableRunError) else event
 
     def _choose(self, scene: Scene) -> Backend:
-        return choose_backend(self._arch, self._threads, scene.solver.precision, optimisation=self._optimisation)
+        own = {"optimisation": self._optimisation, "doubles": Layers.of(scene).separate}
+        return choose_backend(self._arch, self._threads, scene.solver.precision, **own)
 
     def _restart(self, backend: Backend) -> None:
         self._batches.clear()

@@ -24,10 +24,12 @@ TIGHT = {"ftol": 1e-15, "xtol": 1e-15, "gtol": 1e-15}
 def problem(domain: Tables, time: tuple[float, int], fields: str, bodies: Sequence[Tables], **more: Any) -> Tables:
     """Return the tables of a scene: `time` is the end, s, and the number of frames, `fields` names between spaces.
 
-    The tables are copies, because cases share tables of materials and a caller may modify the scene.
+    Bodies stick, unless `more` has a "contact". The tables are copies, because cases share tables of materials and a
+    caller may modify the scene.
     """
     end, frames = time
     parts = {"domain": domain, "time": {"end": end, "frames": frames}, "output": {"fields": fields.split()}}
+    parts["contact"] = {"default": "stick"}
     return deepcopy({**parts, "bodies": [*bodies], **more})
 
 

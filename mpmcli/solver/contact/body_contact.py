@@ -1,9 +1,11 @@
 """Contact of bodies with their own velocity fields: impulses at nodes shared by two bodies or by a body and a wall.
 
-At a node the surface of each body is represented by its distance along an axis: the logarithm of a sum of exponentials
-over nearby points of the surface. The candidates for the axis are the mean of both normals and the normal of each face
-that faces the other body; the axis with the largest gap separates the bodies. The impulse is that of a spring on the
-gap, by backward Euler, with Coulomb friction. See docs/theory.md, 2.8.
+At an obstacle each point of the surface of a body has a spring that acts where the point is inside. A node takes its
+force with the weight with which the node moves the point, so that nodes do the work that springs release. At a node of
+two bodies with parallel faces, surfaces are represented by their distances along the normal, the logarithm of a sum of
+exponentials over nearby points; elsewhere by the distances of the points of each from the other. The impulse is that of
+a spring on the gap. All impulses are implicit in the velocity of the node, with Coulomb friction. See docs/theory.md,
+2.8.
 """
 
 import math
@@ -32,28 +34,43 @@ SHARP = 12.0
 # Sharpness of the mean normal of the faces that face another body. Bodies whose normals have a product above ALIKE face
 # the same direction and not each other.
 FACING, ALIKE = 16.0, 0.7
-# Products of normals above which only one axis is evaluated: of the faces of two bodies, and of an obstacle.
-SAME, SMOOTH = 0.999, 0.9
-# Difference of gaps over which axes are blended, and overlap beyond which the push is constant, cells.
-BLEND, DEEPEST = 0.02, 0.3
+# Product of the normals of the faces of two bodies above which they are parallel.
+SAME = 0.999
+# Product of the normals of an obstacle near a node, and this far along it, cells, above which it is plane there. Points
+# of a body are up to two cells aside.
+PLANE, ASIDE = 0.9999, 2.5
+# Depth of a point below the plane of another, over 1 / beta, from which the surface counts as convex there.
+CONVEX = 0.1
+# Fraction of the velocity after a step with which springs act in it: between bodies, and at obstacles the least with
+# which they make no energy.
+IMPLICIT, IMPLICIT_OBSTACLES = 1.0, 0.5
+# Overlap beyond which the push of bodies on each other is constant, cells.
+DEEPEST = 0.3
 # Range of overlaps, cells, over which the approach of bodies is increasingly stopped, independent of the spring.
 STOPS = (0.1, 0.2)
 # Fraction of the mass of a node at touching flat faces, above which overlaps and gaps of a node are recorded.
 LIGHT = 0.1
-# Reach of the search for further points of an obstacle near its nearest point, cells.
+# Reach of the distance from an obstacle of points near a node, cells.
 FAR_ASIDE = 3.0
 # Largest exponent in single precision, and a number that replaces 0 in divisors and logarithms.
 LARGEST, SMALLEST = 80.0, 1e-37
+# Products of the normals of a point and, opposite, of the body that it meets, up to which it does not count and from
+# which it counts in full: what slides past an edge meets its side with 0. Least product of the normals of faces that
+# meet.
+FACES, MEET = (0.3, 0.6), 0.15
 # Gap, cells, if one of the bodies has no surface here: they are not in contact.
 APART = 9.0
 # Number of GPU threads for the nodes of all runs, limited because each needs memory for surface points, and smallest
 # number per run.
 GPU_THREADS, LEAST_THREADS = 4096, 64
 # Numbers of a layer: P-wave modulus, Pa, sharpness, 1/m, normalisation of the sum over a flat surface, density, kg/m^3,
-# and from FRICTION on the coefficient of friction with each layer, `STICKS` for sticking.
-MODULUS, SHARPNESS, FLAT, DENSITY, FRICTION = range(5)
+# area of a surface point, m^(d-1), and from FRICTION on the coefficient of friction with each layer, `STICKS` for
+# sticking.
+MODULUS, SHARPNESS, FLAT, DENSITY, AREA, FRICTION = range(6)
 # Entries of `LedgerRow`, see `BodyContact.extremes`.
 EXTREMES = ("contact_overlap", "contact_gap")
+# The entry of `LedgerRow` in `BodyContact.loads`.
+WORK = "contact_work"
 
 
 @ti.data_oriented
@@ -66,11 +83,12 @@ class BodyContact:
         capacity: largest number of surface points of a body near a node.
         rows: numbers of each layer of each run, see MODULUS.
         threads: threads of a run on a GPU.
-        loads: loads on the first layer of each pair by the second, about the lower corner, see `Layers.pairs`.
+        loads: loads on the first layer of each pair by the second, about the lower corner, see `Layers.pairs`; the
+            first number of one more row is the work of all contact on what it parts since the last frame, J.
         extremes: per run, the deepest overlap and the largest gap with a push since the last frame, cells.
         points: surface points of two bodies near a node, per thread, row by row: vector to the node, m, additional
-            distance for being off the axis, m, normal, and weight; vectors and normals of the second body have the
-            opposite sign.
+            distance for being off the axis, m, normal, and weight of its particle, at obstacles that with which the
+            node moves the point; vectors and normals of the second body have the opposite sign.
     """
 
     def __init__(
@@ -89,7 +107,7 @@ class BodyContact:
         self.capacity = points_near(grid.scheme.spline.nodes, layers, grid.dimension)
         self.rows = ti.field(float, shape=(runs * layers.count, FRICTION + layers.count))
         self._rows, self._count = Rows(self.rows, self.surfaces.band), Rows(self.surfaces.count)
-        self.pairs, self.loads = layers.pairs, Loads(max(1, layers.pairs), grid.shape, runs, on_cpu=on_cpu)
+        self.pairs, self.loads = layers.pairs, Loads(layers.pairs + 1, grid.shape, runs, on_cpu=on_cpu)
         self.extremes = ti.field(float, shape=(runs, len(EXTREMES)))
         self.share = (2 * grid.dimension + 2) * self.capacity
         self.threads = max(LEAST_THREADS, GPU_THREADS // runs)
@@ -112,14 +130,16 @@ class BodyContact:
                 beta = SHARP / distance
                 width = math.sqrt(2 * math.pi * BALL * h / beta) / distance
                 modulus = material.lame_lambda + 2 * material.shear_modulus
-                rows[layer] = [modulus, beta, width ** (1 - self.dimension), material.density]
+                area = distance ** (self.dimension - 1)
+                rows[layer] = [modulus, beta, width ** (1 - self.dimension), material.density, area]
                 bands[layer] = distance
         self._rows.write(run * self.layers, np.hstack([rows, layers.frictions(scene)]), bands)
 
     def read(self, run: int) -> dict[str, np.ndarray]:
         """Return the loads and the extremes of a run since the last frame, on a GPU, and reset them."""
         extremes = self.extremes.to_numpy()
-        found = {"contact": self.loads.read(run, self.pairs)} | dict(zip(EXTREMES, extremes[run], strict=True))
+        loads = self.loads.read(run, self.pairs + 1)
+        found = {"contact": loads[:-1], WORK: loads[-1, 0]} | dict(zip(EXTREMES, extremes[run], strict=True))
         extremes[run] = 0.0
         self.extremes.from_numpy(extremes)
         return found
@@ -205,8 +225,8 @@ class BodyContact:
         h, d, row = ti.static((grid.spacing, self.dimension, w * self.layers))
         at_a, at_c = index + a * ti.static(self.node_count), index + c * ti.static(self.node_count)
         of_a = self.surfaces.total(grid, node, index, a * ti.static(self.node_count))
-        m_a, bodies, way, agree = of_a[d], c < self.layers, FAR, 0.0
-        reduced, friction, known = m_a, 0.0, True
+        m_a, bodies, way = of_a[d], c < self.layers, FAR
+        reduced, friction = m_a, 0.0
         # The sum of the inverse moduli of both.
         soft = 1.0 / self.rows[row + a, MODULUS]
         u, J, facing = ti.Vector.zero(float, d), ti.Vector.zero(float, d), ti.Vector.zero(float, d)
@@ -220,10 +240,8 @@ class BodyContact:
                 u[b] = of_c[b] / m_c - of_a[b] / m_a
         if ti.static(obstacles.any):
             if not bodies:
-                distance, normal, velocity, rough, same = self.collect_obstacle(
-                    obstacles, thread, c - self.layers, place_of(node, h)
-                )
-                way, friction, agree = distance, rough, same
+                distance, normal, velocity, rough = obstacles.at(c - self.layers, place_of(node, h), REACH)
+                way, friction = distance, rough
                 for b in ti.static(range(d)):
                     facing[b] = normal[b]
                     u[b] = velocity[b] - gravity_step[b] - of_a[b] / m_a
@@ -231,23 +249,19 @@ class BodyContact:
             for b in ti.static(range(d)):
                 J[b] = -reduced * u[b]
         elif bodies or way < REACH * h:
-            gap, middle, n, aside = self.separation(grid, w, thread, node, index, a, c, facing, agree)
-            if gap >= APART * h and way <= 0.0:
-                # Material without a surface, because it was torn or crushed, is stopped behind an obstacle.
-                gap, middle, n, aside, known = -h, gap, -facing, 0.0 * facing, False
-            if gap < APART * h:
-                # Mass of such a node at flat faces. Nodes with less mass, which are at edges, push less.
-                light = 1.0 / (self.rows[row + a, DENSITY] * filled((0.5 * gap + middle) * grid.inverse_spacing))
+            gap, n, aside, kappa, deepest = self.separation(
+                grid, obstacles, w, thread, node, index, a, c, way, facing, reduced, 2.0 / soft * dt**2
+            )
+            if kappa >= 0.0:
+                spring, implicit = gap / h, IMPLICIT_OBSTACLES
                 if bodies:
-                    light += 1.0 / (self.rows[row + c, DENSITY] * filled((0.5 * gap - middle) * grid.inverse_spacing))
-                mass = ti.max(reduced, h**d / light)
-                kappa = 2.0 / soft * h ** ti.static(d - 2) * traction(middle * grid.inverse_spacing) * dt**2 / mass
-                pushed = self.impulse(gap / h, u, n, aside, kappa, reduced, h / dt, friction)
+                    spring, implicit = ti.max(spring, -DEEPEST), IMPLICIT
+                pushed = self.impulse(gap / h, spring, u, n, aside, kappa, implicit, reduced, h / dt, friction)
                 for b in ti.static(range(d)):
                     J[b] = pushed[b]
-                # Nodes with very little mass, beside edges, do not represent a surface and are not recorded.
-                if known and pushed.dot(n) > 0.0 and reduced > LIGHT * mass:
-                    for k, reached in ti.static(enumerate((-gap / h, gap / h))):
+                self.loads.add(w, node, ti.static(self.pairs), 0, pushed.dot(u + pushed / reduced))
+                if pushed.dot(n) > 0.0:
+                    for k, reached in ti.static(enumerate((deepest / h, gap / h))):
                         # Most values are not extremes, and atomic operations are slow.
                         if reached > self.extremes[w, k]:
                             ti.atomic_max(self.extremes[w, k], reached)
@@ -265,10 +279,12 @@ class BodyContact:
     def impulse(
         self,
         gap: float,
+        spring: float,
         u: ti.template(),
         n: ti.template(),
         aside: ti.template(),
         kappa: float,
+        implicit: float,
         reduced: float,
         speed: float,
         friction: float,
@@ -276,16 +292,17 @@ class BodyContact:
         """Return the impulse from a to c at a node, N s.
 
         Args:
-            gap: gap, cells.
+            gap: gap, cells; spring: the gap for the spring.
             u: velocity of c relative to a, m/s.
             n, aside: see `separation`.
             kappa: k dt^2 / m of the spring.
+            implicit: fraction of the velocity after the step with which it acts.
             reduced: m_a m_c / (m_a + m_c), kg.
             speed: speed of one cell per step, m/s.
             friction: coefficient of friction.
         """
         away = u.dot(n)
-        push = ti.max(0.0, -away - ti.max(gap, -DEEPEST) * speed) * kappa / (1.0 + kappa)
+        push = ti.max(0.0, -implicit * away - spring * speed) * kappa / (1.0 + implicit * kappa)
         # Approach that is too fast for the spring is stopped.
         push = reduced * ti.max(push, -away * ti.min(ti.max((-gap - STOPS[0]) / (STOPS[1] - STOPS[0]), 0.0), 1.0))
         along = u + aside
@@ -299,91 +316,224 @@ class BodyContact:
     def separation(
         self,
         grid: ti.template(),
+        obstacles: ti.template(),
         w: int,
         thread: int,
         node: ti.template(),
         index: int,
         a: int,
         c: int,
+        way: float,
         facing: ti.template(),
-        agree: float,
+        reduced: float,
+        stiffness: float,
     ):
         """Return the gap between layers a and c at a node, and the geometry of the contact.
 
         Args:
             a: layer of a body.
-            c: layer of another body, or number of an obstacle whose points were collected.
-            facing, agree: results of `collect_obstacle` for an obstacle.
+            c: layer of another body, or the number of layers plus the number of an obstacle.
+            way, facing: distance of the node from the obstacle, m, and its normal there.
+            reduced: m_a m_c / (m_a + m_c), kg.
+            stiffness: of a spring per volume of cells, times dt^2, kg/m^3 m^2.
 
         Returns:
             gap: the gap, m.
-            middle: distance of the node from the middle of the gap, m.
             normal: normal from a to c.
             aside: correction of the velocity of c relative to a from the node to the surfaces, m/s.
+            kappa: k dt^2 / m of the spring at the node, -1 without contact.
+            deepest: the deepest overlap, m; negative at nodes that do not represent a surface.
         """
         h, d, row = ti.static((grid.spacing, self.dimension, w * self.layers))
-        gap, middle, normal, smooth = APART * h, 0.0, ti.Vector.zero(float, d), agree > SMOOTH
+        gap, normal, far, kappa, deepest = 0.0, ti.Vector.zero(float, d), ti.Vector.zero(float, 2), -1.0, 0.0
         n_a, n_c, counts, slopes = self.collect(grid, w, thread, node, index, a, c)
-        if c >= self.layers:
-            n_c, counts[1] = facing, 2 * d - 1
-        if counts.min() > 0 and n_a.dot(n_c) < ALIKE:
-            normal = (n_a - n_c).normalized(SMALLEST)
-            if smooth:
-                normal = -n_c
-            axes, gaps, first_axis = ti.Matrix.zero(float, 4, d), ti.Vector.zero(float, 3), 3
-            if not smooth:
-                alike = 0.0
-                for side in range(2):
-                    stay_rolled(self.points, thread + side)
-                    towards = ti.select(side == 0, -n_c, n_a)
-                    met = self.normal_along((2 * thread + side) * self.share, counts[side], towards)
-                    for b in ti.static(range(d)):
-                        axes[side, b] = met[b]
-                        alike += axes[0, b] * axes[1, b]
+        if ti.static(obstacles.any):
+            if c >= self.layers:
+                gap, area, off, axis, most = self.springs(
+                    obstacles, thread, counts[0], c - self.layers, place_of(node, h), row + a, way, facing
+                )
+                if counts[0] == 0 and way <= 0.0:
+                    # Material without a surface, because it was torn or crushed, is stopped behind an obstacle.
+                    gap, axis, kappa = -h, -facing, 0.0
+                if area > 0.0:
+                    far[0], deepest, kappa = off, most, stiffness / h * area / reduced
                 for b in ti.static(range(d)):
-                    axes[2, b] = normal[b]
-                if alike < SAME:
-                    first_axis = 0
-                else:
-                    # Not the mean of n_a and -n_c, which tilts beside edges.
-                    for b in ti.static(range(d)):
-                        normal[b] = axes[0, b] + axes[1, b]
-                    normal = normal.normalized()
+                    normal[b] = axis[b]
+        if c < self.layers and counts.min() > 0 and n_a.dot(n_c) < ALIKE:
+            # The faces of the bodies that look at each other. Mean normals tilt beside edges.
+            faces, alike, middle = ti.Matrix.zero(float, 2, d), 0.0, 0.0
+            for side in range(2):
+                stay_rolled(self.points, thread + side)
+                towards = ti.select(side == 0, -n_c, n_a)
+                met = self.normal_along((2 * thread + side) * self.share, counts[side], towards)
+                for b in ti.static(range(d)):
+                    faces[side, b] = met[b]
+                    alike += faces[0, b] * faces[1, b]
             for b in ti.static(range(d)):
-                axes[3, b] = normal[b]
-            for j in range(first_axis, 4):
-                stay_rolled(self.points, thread + j)
-                axis, far = ti.Vector.zero(float, d), ti.Vector.zero(float, 2)
-                for b in ti.static(range(d)):
-                    axis[b] = axes[j, b]
+                normal[b] = faces[0, b] + faces[1, b]
+            normal, meet = normal.normalized(SMALLEST), alike > MEET
+            if alike < SAME:
+                found, axis, off = self.between(thread, counts, row + a, row + c)
+                # Without any point that faces the other body the axis is zero: faces that hardly look at each other.
+                if axis.norm_sqr() > 0.5:
+                    gap, middle, meet, kappa = found, off, False, 1.0
+                    for b in ti.static(range(d)):
+                        normal[b] = axis[b]
+            if meet:
                 for side in range(2):
                     stay_rolled(self.points, thread + side)
-                    layer = row + ti.select(side == 0 or c >= self.layers, a, c)
+                    layer = row + ti.select(side == 0, a, c)
                     first, beta = (2 * thread + side) * self.share, self.rows[layer, SHARPNESS]
                     inverse_width = ti.static(0.5 / BALL) * grid.inverse_spacing
-                    total = self.sum_points(first, counts[side], axis, beta, inverse_width)
-                    flat = self.rows[layer, FLAT]
-                    if side == 1 and c >= self.layers:
-                        flat = 1.0 / (1.0 + ti.static(2 * (d - 1)) * exp(-beta * h * ti.static(0.5 / BALL)))
-                    far[side] = -log(ti.max(total * flat, SMALLEST)) / beta
-                gap, middle = far[0] + far[1], 0.5 * (far[0] - far[1])
-                if j < 3:
-                    gaps[j] = gap
-                if j == 2:
-                    # Blended, so that the axis changes continuously.
-                    best, blend = gaps.max(), ti.Vector.zero(float, d)
-                    for i in range(3):
-                        share = exp(ti.max((gaps[i] - best) * grid.inverse_spacing / BLEND, -LARGEST))
-                        for b in ti.static(range(d)):
-                            blend[b] += share * axes[i, b]
-                    normal = blend.normalized(SMALLEST)
-                    for b in ti.static(range(d)):
-                        axes[3, b] = normal[b]
+                    total = self.sum_points(first, counts[side], normal, beta, inverse_width)
+                    far[side] = -log(ti.max(total * self.rows[layer, FLAT], SMALLEST)) / beta
+                gap, middle, kappa = far[0] + far[1], 0.5 * (far[0] - far[1]), 1.0
+            if kappa > 0.0:
+                far[0], far[1] = 0.5 * gap + middle, 0.5 * gap - middle
+                # Mass of such a node at flat faces. Nodes with less mass, which are at edges, push less.
+                light = 0.0
+                for side in range(2):
+                    density = self.rows[row + ti.select(side == 0, a, c), DENSITY]
+                    light += 1.0 / (density * filled(far[side] * grid.inverse_spacing))
+                mass = ti.max(reduced, h**d / light)
+                kappa = stiffness * h ** ti.static(d - 2) * traction(middle * grid.inverse_spacing) / mass
+                # Nodes with very little mass, beside edges, do not represent a surface.
+                deepest = ti.select(reduced > LIGHT * mass, -gap, 0.0)
         # Change of velocity from the node to the surface of each body, along its normal.
         aside = ti.Vector.zero(float, d)
         for b in ti.static(range(d)):
-            aside[b] = (0.5 * gap + middle) * slopes[0, b] - (0.5 * gap - middle) * slopes[1, b]
-        return gap, middle, normal, aside
+            aside[b] = far[0] * slopes[0, b] - far[1] * slopes[1, b]
+        return gap, normal, aside, kappa, deepest
+
+    @ti.func
+    def springs(
+        self,
+        obstacles: ti.template(),
+        thread: int,
+        count: int,
+        o: int,
+        x: ti.template(),
+        row: int,
+        way_there: float,
+        facing_there: ti.template(),
+    ):
+        """Return the share of a node at x in the springs of the points of a body that are inside an obstacle.
+
+        Returns:
+            gap: minus their mean overlap, m.
+            area: sum of their areas, m^(d-1).
+            far: distance of x from the surface of the body along the axis, m.
+            axis: mean normal of the obstacle at these points, from the body to the obstacle.
+            deepest: overlap of the deepest of them, m.
+        """
+        d = ti.static(self.dimension)
+        h, first, area, deepest, weights = obstacles.spacing, 2 * thread * self.share, 0.0, 0.0, 0.0
+        force, mean = ti.Vector.zero(float, d), ti.Vector.zero(float, d)
+        # Whether the obstacle is plane here, which saves most evaluations of its distance.
+        plane, place = True, ti.Vector.zero(float, d)
+        for k in range(2 * (d - 1)):
+            if plane:
+                place = x - way_there * facing_there
+                place += ti.select(k % 2 == 0, ASIDE, -ASIDE) * h * tangent(facing_there, ti.raw_div(k, 2))
+                _distance, normal, _velocity, _friction = obstacles.at(o, place, FAR_ASIDE)
+                plane = normal.dot(facing_there) > PLANE
+        for k in range(count):
+            way, distance, normal = ti.Vector.zero(float, d), way_there, ti.Vector.zero(float, d)
+            for b in ti.static(range(d)):
+                way[b] = self.points[first + k + b * self.capacity]
+                place[b] = x[b] - way[b]
+                normal[b] = facing_there[b]
+                distance -= way[b] * facing_there[b]
+            if not plane:
+                found, there, _velocity, _friction = obstacles.at(o, place, FAR_ASIDE)
+                distance = found
+                for b in ti.static(range(d)):
+                    normal[b] = there[b]
+            if distance < 0.0:
+                share = self.points[first + k + ti.static(2 * d + 1) * self.capacity] * self.rows[row, AREA]
+                push = -share * distance
+                area += ti.abs(share)
+                weights += ti.abs(push)
+                deepest = ti.max(deepest, -distance)
+                for b in ti.static(range(d)):
+                    force[b] -= push * normal[b]
+                    mean[b] += ti.abs(push) * way[b]
+        # Divided first, because the squares of weights may be too small for single precision.
+        force /= ti.max(area, SMALLEST)
+        overlap = force.norm()
+        axis = force / ti.max(overlap, SMALLEST)
+        return -overlap, area, mean.dot(axis) / ti.max(weights, SMALLEST), axis, deepest
+
+    @ti.func
+    def between(self, thread: int, counts: ti.template(), row_a: int, row_c: int):
+        """Return the gap between two bodies near a node where both are, and the geometry of the contact.
+
+        It is the smooth minimum of the distances of the points of each from the surface of the other. That surface
+        consists of the planes of its points: the nearest one and, around an edge, the one that is farther out.
+
+        Returns:
+            gap: the gap, m.
+            axis: the mean normal of these planes, from a to c.
+            middle: distance of the node from the middle of the gap, m.
+        """
+        d = ti.static(self.dimension)
+        gap, axis, means = LARGEST, ti.Vector.zero(float, d), ti.Matrix.zero(float, 2, d)
+        for side in range(2):
+            stay_rolled(self.points, thread + side)
+            own, other = (2 * thread + side) * self.share, (2 * thread + 1 - side) * self.share
+            row = ti.select(side == 0, row_a, row_c)
+            beta = self.rows[row, SHARPNESS]
+            inside = -CONVEX / self.rows[ti.select(side == 0, row_c, row_a), SHARPNESS]
+            total, mean, faces = 0.0, ti.Vector.zero(float, d), ti.Vector.zero(float, d)
+            for k in range(counts[side]):
+                way, face, place = ti.Vector.zero(float, d), ti.Vector.zero(float, d), ti.Vector.zero(float, d)
+                size, nearest, distance = 0.0, FAR, 0.0
+                for b in ti.static(range(d)):
+                    way[b] = self.points[own + k + b * self.capacity]
+                    size += way[b] ** 2
+                for j in range(counts[1 - side]):
+                    apart = 0.0
+                    for b in ti.static(range(d)):
+                        apart += (way[b] + self.points[other + j + b * self.capacity]) ** 2
+                    if apart < nearest:
+                        nearest, distance = apart, 0.0
+                        for b in ti.static(range(d)):
+                            place[b] = self.points[other + j + b * self.capacity]
+                            face[b] = self.points[other + j + ti.static(d + 1 + b) * self.capacity]
+                            distance += (way[b] + place[b]) * face[b]
+                for j in range(counts[1 - side]):
+                    off, below = 0.0, 0.0
+                    for b in ti.static(range(d)):
+                        there = self.points[other + j + b * self.capacity]
+                        n = self.points[other + j + ti.static(d + 1 + b) * self.capacity]
+                        off += (way[b] + there) * n
+                        below += (there - place[b]) * n
+                    if below < inside and off > distance:
+                        distance = off
+                        for b in ti.static(range(d)):
+                            face[b] = self.points[other + j + ti.static(d + 1 + b) * self.capacity]
+                along, facing = way.dot(face), 0.0
+                for b in ti.static(range(d)):
+                    facing += face[b] * self.points[own + k + ti.static(d + 1 + b) * self.capacity]
+                # The ball of the point, as in `sum_points`.
+                aside = self.points[own + k + d * self.capacity] * (1.0 - along**2 / ti.max(size, SMALLEST))
+                counted = ti.min(ti.max((facing - FACES[0]) / (FACES[1] - FACES[0]), 0.0), 1.0)
+                share = counted * exp(ti.min(ti.max(-beta * (distance + aside), -LARGEST), LARGEST))
+                total += share
+                for b in ti.static(range(d)):
+                    mean[b] += share * way[b]
+                    faces[b] += share * face[b]
+            gap = ti.min(gap, -log(ti.max(total * self.rows[row, FLAT], SMALLEST)) / beta)
+            for b in ti.static(range(d)):
+                means[side, b] = mean[b] / ti.max(total, SMALLEST)
+                axis[b] += faces[b] / ti.max(total, SMALLEST)
+        axis, far, seen = axis.normalized(SMALLEST), ti.Vector.zero(float, 2), ti.Vector.zero(float, 2)
+        for side, b in ti.static(ti.ndrange(2, d)):
+            far[side] += means[side, b] * axis[b]
+            seen[side] = ti.max(seen[side], ti.cast(means[side, b] != 0.0, float))
+        # From both bodies, or from the one whose points face the other.
+        middle = (seen[0] * (far[0] - 0.5 * gap) - seen[1] * (far[1] - 0.5 * gap)) / ti.max(seen.sum(), 1.0)
+        return gap, axis, middle
 
     @ti.func
     def collect(self, grid: ti.template(), w: int, thread: int, node: ti.template(), index: int, a: int, c: int):
@@ -412,7 +562,7 @@ class BodyContact:
                                     for b in ti.static(range(d)):
                                         way[b] = ti.cast(there[b] - PAD, float) * h - self.surfaces.groups[g].x[p][b]
                                         n[b] = self.surfaces.surface[g][p][b]
-                                        weight *= spline(way[b] * grid.inverse_spacing)
+                                        weight *= grid.scheme.spline.at(way[b] * grid.inverse_spacing)
                                     if side == 0:
                                         n_a += weight * n
                                     else:
@@ -423,6 +573,10 @@ class BodyContact:
                                     depth = self.surfaces.surface[g][p][d]
                                     if counts[side] < self.capacity:
                                         at = (2 * thread + side) * self.share + counts[side]
+                                        if c >= self.layers:
+                                            # The point moves with v + C (y - x), C = D^-1 sum w_i v_i (x_i - x)^T.
+                                            lever = depth * way.dot(n) * grid.inverse_spacing**2
+                                            weight *= 1.0 + ti.static(grid.scheme.spline.inverse_moment) * lever
                                         for b in ti.static(range(d)):
                                             # Entry by entry, because Taichi may lose vectors assigned as a whole.
                                             way[b] -= depth * n[b]
@@ -435,35 +589,6 @@ class BodyContact:
         for side, b in ti.static(ti.ndrange(2, d)):
             slopes[side, b] /= ti.max(weights[side], SMALLEST)
         return n_a.normalized(SMALLEST), n_c.normalized(SMALLEST), counts, slopes
-
-    @ti.func
-    def collect_obstacle(self, obstacles: ti.template(), thread: int, o: int, x: ti.template()):
-        """Store points of an obstacle near x, like those of a second body in `collect`, if it is within reach.
-
-        They are the nearest point, and the points nearest to positions one cell beside it, two along each tangent.
-        Return the results of `Obstacles.at`, and the smallest product of another normal with that of the nearest point.
-        """
-        h, d = ti.static((obstacles.spacing, self.dimension))
-        place, nearest, facing, velocity = x, x, ti.Vector.zero(float, d), ti.Vector.zero(float, d)
-        way, friction, agree, count, k = FAR, 0.0, 1.0, 1, 0
-        while k < count:
-            if k > 0:
-                place = nearest + ti.select(k % 2 == 0, h, -h) * tangent(facing, ti.raw_div(k - 1, 2))
-            distance, normal, pace, rough = obstacles.at(o, place, ti.select(k == 0, REACH, FAR_ASIDE))
-            point = place - distance * normal
-            if k == 0:
-                nearest, facing, way, velocity, friction = point, normal, distance, pace, rough
-                if way < REACH * h:
-                    count = 2 * d - 1
-            agree = ti.min(agree, normal.dot(facing))
-            at = (2 * thread + 1) * self.share + k
-            for b in ti.static(range(d)):
-                self.points[at + b * self.capacity] = point[b] - x[b]
-                self.points[at + ti.static(d + 1 + b) * self.capacity] = -normal[b]
-            self.points[at + d * self.capacity] = (x - point).norm_sqr() * (0.5 / BALL) / h
-            self.points[at + ti.static(2 * d + 1) * self.capacity] = 1.0
-            k += 1
-        return way, facing, velocity, friction, agree
 
     @ti.func
     def sum_points(self, first: int, count: int, axis: ti.template(), beta: float, inverse_width: float):
@@ -534,14 +659,6 @@ def tangent(normal: ti.template(), k: int):
         if k == 1:
             result = normal.cross(result)
     return result
-
-
-@ti.func
-def spline(r: float):
-    """Return the quadratic B-spline at r cells from its node."""
-    far = ti.abs(r)
-    beyond = ti.max(1.5 - far, 0.0)
-    return ti.select(far < 0.5, 0.75 - far**2, 0.5 * beyond**2)
 
 
 @ti.func

@@ -8,11 +8,10 @@ import numpy as np
 from mpmcli.errors import InputError
 from mpmcli.scene import Scene
 from mpmcli.scene.sampling import points_per_cell
+from mpmcli.scene.schema import MOST_FIELDS
 from mpmcli.solver.grid.sparse_grid import wants_sparse
 from mpmcli.solver.machine.backend import Backend
 
-# A node stores the numbers of the layers with mass in bytes of one integer; of more than eight, the first are lost.
-MOST_LAYERS = 255
 # Used instead of a coefficient of friction: both layers have the same velocity at common nodes.
 STICKS = -1.0
 
@@ -82,7 +81,7 @@ def require_contact_possible(scene: Scene, backend: Backend) -> None:
         "with solver.deterministic = true on a GPU": solver.deterministic and not backend.on_cpu,
         'with solver.solids = "total"': solver.solids == "total",
         'with solver.grid = "sparse"': wants_sparse(scene),
-        f"for more than {MOST_LAYERS} bodies": layers.count > MOST_LAYERS,
+        f"for more than {MOST_FIELDS} bodies": layers.count > MOST_FIELDS,
     }
     for reason, applies in reasons.items():
         if applies and layers.separate:

@@ -13,7 +13,7 @@ from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.scene import BodyParticles, Scene, estimate_particles, sample_bodies
 from mpmcli.scene.colliders import Collider
-from mpmcli.solver.contact.layers import require_contact_possible
+from mpmcli.solver.contact.layers import Layers, require_contact_possible
 from mpmcli.solver.drive.expressions import RunValues
 from mpmcli.solver.drive.forces import Drives, ExternalForces
 from mpmcli.solver.engine.batch import Batch
@@ -644,7 +644,8 @@ def backend_for(
     Raises:
         InputError: the backend cannot be used.
     """
-    backend = choose_backend(arch, threads, scene.solver.precision, compile_cache=compile_cache)
+    doubles, precision = Layers.of(scene).separate, scene.solver.precision
+    backend = choose_backend(arch, threads, precision, compile_cache=compile_cache, doubles=doubles)
     if not backend.on_cpu:
         return backend
     threads = threads or useful_threads(estimate_particles(scene), backend.threads)

@@ -260,7 +260,7 @@ class Moment(NamedTuple):
         taken: the steps since the previous frame.
         loads: "collider": impulse, N s, and angular impulse, N m s, on each collider since the previous frame, (count,
             k); "contact": the same on the first body of each pair; "rigid": pose relative to the lower corner and rates
-            of each rigid body, (count, k); and `EXTREMES`. Entries without objects are missing.
+            of each rigid body, (count, k); `WORK` and `EXTREMES`. Entries without objects are missing.
         blocked: number of blocked particles of emitters so far.
     """
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
-from mpmcli.solver.contact.body_contact import EXTREMES
+from mpmcli.solver.contact.body_contact import EXTREMES, WORK
 from mpmcli.solver.engine.batch import Batch
 from mpmcli.solver.engine.run_state import FRAME_NUMBERS, LIMITS, MOST_FRAMES, RunState
 from mpmcli.solver.frames.builder import NO_STEPS, FrameBuilder, Moment, StepsTaken, Sums
@@ -98,8 +98,10 @@ class FrameRecorder:
             if takers is not None:
                 size = takers.loads.capacity * takers.loads.width
                 number = kind.layers.pairs if name == "contact" else takers.count_of(self._slot)
-                found[name] = rest[:, :size].reshape(count, -1, takers.loads.width)[:, :number]
-                rest = rest[:, size:]
+                own, rest = np.split(rest, [size], axis=1)
+                found[name] = own.reshape(count, -1, takers.loads.width)[:, :number]
+                if name == "contact":
+                    found[WORK] = own.reshape(count, -1, takers.loads.width)[:, number, 0]
         if device.rigid is not None:
             size = device.rigid.width + device.rigid.loads
             found["rigid"] = rest[:, : device.rigid.count * size].reshape(count, -1, size)

@@ -92,11 +92,12 @@ def choose_backend(
     *,
     compile_cache: bool = True,
     optimisation: Optimisation | None = None,
+    doubles: bool = False,
 ) -> Backend:
     """Return the backend for a name on this machine without starting it.
 
-    "auto" selects Metal on a Mac (in f32), CUDA if a driver and a device are present, and otherwise the CPU. Vulkan is
-    selected only by name, because software Vulkan counts as a device.
+    "auto" selects Metal on a Mac (in f32, unless kernels need `doubles`), CUDA if a driver and a device are present,
+    and otherwise the CPU. Vulkan is selected only by name, because software Vulkan counts as a device.
 
     Args:
         threads: number of CPU threads; None for one per core.
@@ -110,7 +111,7 @@ def choose_backend(
         raise InputError(f'--arch "{arch}" is not a backend; use one of {", ".join(ARCHES)}.')
     if precision not in ("f32", "f64"):
         raise InputError(f'precision "{precision}" is not known; use f32 or f64.')
-    wanted = _best(precision) if arch == "auto" else arch
+    wanted = _best(doubles or precision == "f64") if arch == "auto" else arch
     if wanted in ("vulkan", "metal") and precision == "f64":
         raise InputError(f"precision f64 is not available on {wanted}; use --arch cpu or cuda, or f32.")
     cores = available_cores()
@@ -207,9 +208,9 @@ def _spare_cache() -> str:
     return tempfile.mkdtemp(prefix="mpmcli-cache-")
 
 
-def _best(precision: str) -> str:
-    """Return the name of the fastest backend of this machine for this precision."""
-    if platform.system() == "Darwin" and precision == "f32" and backend_is_here("metal"):
+def _best(doubles: bool) -> str:
+    """Return the name of the fastest backend of this machine, for kernels with or without double precision."""
+    if platform.system() == "Darwin" and not doubles and backend_is_here("metal"):
         return "metal"
     return "cuda" if backend_is_here("cuda") else "cpu"
 

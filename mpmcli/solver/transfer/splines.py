@@ -48,6 +48,13 @@ class QuadraticSpline:
         """Return the weights, a row for each of the three nodes and a column per axis (Steffen et al. 2008, eq. 24)."""
         return ti.Matrix.rows([0.5 * (1.5 - distance) ** 2, 0.75 - (distance - 1.0) ** 2, 0.5 * (distance - 0.5) ** 2])
 
+    @ti.func
+    def at(self, r: float):
+        """Return the weight of a node at r cells."""
+        far = ti.abs(r)
+        beyond = ti.max(1.5 - far, 0.0)
+        return ti.select(far < 0.5, 0.75 - far**2, 0.5 * beyond**2)
+
 
 @ti.data_oriented
 class CubicSpline:
@@ -72,6 +79,13 @@ class CubicSpline:
         return ti.Matrix.rows(
             [down**3 / 6.0, 2.0 / 3.0 - up**2 + 0.5 * up**3, 2.0 / 3.0 - down**2 + 0.5 * down**3, up**3 / 6.0]
         )
+
+    @ti.func
+    def at(self, r: float):
+        """Return the weight of a node at r cells."""
+        far = ti.abs(r)
+        beyond = ti.max(2.0 - far, 0.0)
+        return ti.select(far < 1.0, 2.0 / 3.0 - far**2 + 0.5 * far**3, beyond**3 / 6.0)
 
 
 SPLINES = {"quadratic": QuadraticSpline(), "cubic": CubicSpline()}
