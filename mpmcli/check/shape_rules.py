@@ -107,7 +107,8 @@ def _sticking(facts: SceneFacts) -> Iterator[Finding]:
         if scene.solver.solids == "total":
             how = "meet a quarter of a cell early, and slide on each other without friction"
         what = f"With {scene.one_field} the elastic bodies {several(quoted(elastic))} {how}."
-        yield Finding("note", "contact", what, "Change this to resolve contact at their surfaces.", len(elastic))
+        fix = "Change this to resolve contact at their surfaces."
+        yield Finding("note", "contact", what, fix, len(elastic), elastic[0])
         return
     domain, d = scene.domain, scene.dimension
     faces = zip(domain.walls.faces(d), domain.frictions, strict=True)

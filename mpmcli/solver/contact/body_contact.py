@@ -292,7 +292,8 @@ class BodyContact:
         """Return the impulse from a to c at a node, N s.
 
         Args:
-            gap: gap, cells; spring: the gap for the spring.
+            gap: gap, cells.
+            spring: the gap in the force of the spring, cells.
             u: velocity of c relative to a, m/s.
             n, aside: see `separation`.
             kappa: k dt^2 / m of the spring.
