@@ -1,13 +1,17 @@
 """Bodies with velocity fields of their own meet walls and colliders where their surfaces are, slide, roll and part."""
 
 import math
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import ROOT
 from contact_scenes import DENSITY, E, G, H, body, jelly, scene
 
+from mpmcli.check.collider_work import work_of_colliders
 from mpmcli.check.result_check import HELD, check_kept, energy_change
 from mpmcli.frames.frame import Frame
 from mpmcli.materials.registry import laws
@@ -18,6 +22,8 @@ from mpmcli.solver.engine.run import build_run
 
 C = math.sqrt(E / DENSITY)
 STIFF = jelly(youngs_modulus=4e6)
+# Where bodies fall on obstacles, cells.
+MIDDLES = {"post": 30.0, "edge": 37.0, "wedge": 62.0, "corner": 74.0, "ball": 112.0}
 
 
 def on_one(way: str, at: list[float], normal: list[float], friction: float = 0.0, **motion: object) -> dict:
@@ -215,27 +221,71 @@ def test_jelly_stays_out_of_a_wedge(backend_of: Callable) -> None:
     assert min(frame.position[:, 1].min() for frame in frames) < 11.5 * H
 
 
-def on_an_edge(way: str, friction: float, youngs_modulus: float, shift: float) -> Scene:
-    """A block of 16 cells that falls on a narrower post, its edge, a wedge or a ball, "shift" cells off the grid."""
-    place = 26.0 + 32 * ["post", "wedge", "ball"].index(way) if way != "edge" else 33.0
-    low = [place - 4, 10.5 if way == "post" else 10.2]
-    block = body(
-        "block",
-        [x + shift for x in low],
-        [x + 16 + shift for x in low],
-        material=jelly(youngs_modulus=youngs_modulus),
-    )
-    corners = np.array([[50.0, 0.0], [74.0, 0.0], [62.0, 10.0]])
+def on_an_edge(way: str, friction: float, youngs_modulus: float, shift: float, fine: int = 1) -> Scene:
+    """A block of 16 cells that falls on a narrower post, its edge, a wedge or a ball, or a disc between two wedges.
+
+    All is `shift` cells off the grid; with `fine` the same on a finer grid.
+    """
+    shift /= fine
+    material, middle = jelly(youngs_modulus=youngs_modulus), MIDDLES[way]
+    low = [middle - 8 + shift, shift + (10.5 if way == "post" else 10.2)]
+    block = body("block", low, [x + 16 for x in low], material=material)
+    if way == "corner":
+        block["shape"] = {"ball": {"center": [(middle + shift) * H, (12.2 + shift) * H], "radius": 9 * H}}
+    corners = np.array([[38.0, -10.0], [86.0, -10.0], [62.0, 10.0]])
+    wedges = (((corners + place + shift) * H).tolist() for place in ([0, 0], [24, 0]))
     shapes = {
         "post": {"box": {"min": [(26 + shift) * H, -2 * H], "max": [(34 + shift) * H, (10 + shift) * H]}},
-        "wedge": {"polygon": {"vertices": ((corners + shift) * H).tolist()}},
-        "ball": {"ball": {"center": [(94 + shift) * H, (2 + shift) * H], "radius": 8 * H}},
+        **{f"wedge_{k}": {"polygon": {"vertices": wedge}} for k, wedge in enumerate(wedges)},
+        "ball": {"ball": {"center": [(MIDDLES["ball"] + shift) * H, (2 + shift) * H], "radius": 8 * H}},
     }
     colliders = [{"name": name, "shape": shape, "friction": friction} for name, shape in shapes.items()]
-    tables = {"gravity": [0.0, -G], "size": [128 * H, 48 * H]}
+    tables = {"gravity": [0.0, -G], "size": [128 * H, 48 * H], "spacing": H / fine}
     # From the edge it tips.
     end = 0.45 if way == "edge" else 1.0
     return scene([block], end=end, frames=50, domain=tables, colliders=colliders)
+
+
+def between_jaws(way: str, friction: float, youngs_modulus: float, shift: float, fine: int = 1) -> Scene:
+    """A block of 16 cells that jaws half as high squeeze, move a little, and keep; or lift, carry, set down and leave.
+
+    The way of the jaws is one formula, so that kernels are the same.
+    """
+    shift /= fine
+    heavy = way == "gripper"
+    far, down, opens = (12 * H, 1.1, 1.5) if heavy else (H, 9.0, 9.0)
+    low = np.array([22 + shift, 0.0 if heavy else 10 + shift])
+    block = body("block", low.tolist(), (low + 16).tolist(), material=jelly(youngs_modulus=youngs_modulus))
+    squeeze = f"{0.8 * H}*(clamp(t/0.3,0,1)-clamp((t-{opens})/0.2,0,1))"
+    up = f"{far}*(clamp((t-0.4)/0.3,0,1)-clamp((t-{down})/0.3,0,1))"
+    colliders = [
+        {
+            "name": name,
+            "shape": {"box": {"min": (H * (low + at)).tolist(), "max": (H * (low + at + [10, 8])).tolist()}},
+            "friction": friction,
+            "offset": [f"{0.5 * far}*clamp((t-0.7)/0.4,0,1){sign}{squeeze}", up],
+        }
+        for name, at, sign in (("left", [-10, 4], "+"), ("right", [16, 4], "-"))
+    ]
+    tables = {"gravity": [0.0, -G if heavy else 0.0], "size": [64 * H, 48 * H], "walls": "separate"}
+    tables["spacing"] = H / fine
+    return scene([block], end=2.0, frames=100, domain=tables, colliders=colliders)
+
+
+def on_a_post_in_3d() -> Scene:
+    """A cube of 8 cells on a post half as wide, off the grid."""
+    post = {"box": {"min": [6.3 * H, 6.3 * H, -2 * H], "max": [10.3 * H, 10.3 * H, 4.3 * H]}}
+    domain = {"size": [16 * H] * 3, "gravity": [0.0, 0.0, -G], "walls": {"default": "separate", "z_min": "stick"}}
+    colliders = [{"name": "post", "shape": post, "friction": 0.5}]
+    return scene([body("cube", [4.3] * 3, [12.3] * 3)], end=0.6, frames=60, domain=domain, colliders=colliders)
+
+
+def worked(asked: Scene, backend: object) -> tuple[np.ndarray, np.ndarray, list]:
+    """Return energy less the work of colliders, and the work of contact, over what is turned over, and the ledger."""
+    rows = [row for _, row in build_run(asked, backend).frames()]
+    energy = np.array([row.energy for row in rows]) - work_of_colliders(rows, asked.colliders)
+    turned = max(row.kinetic + row.elastic for row in rows)
+    return (energy - energy[0]) / turned, np.cumsum([row.contact_work for row in rows]) / turned, rows
 
 
 @pytest.mark.parametrize(
@@ -246,15 +296,69 @@ def on_an_edge(way: str, friction: float, youngs_modulus: float, shift: float) -
         ("wedge", 0.0, 30 * E, 0.0),
         ("ball", 0.5, 30 * E, 0.3),
         ("edge", 0.5, E, 0.3),
+        ("corner", 0.5, E, 0.3),
+        pytest.param(("corner", 0.0, 30 * E, 0.0), marks=pytest.mark.slow),
+        pytest.param(("post", 0.5, E, 0.3, 2), marks=pytest.mark.slow),
     ],
 )
 def test_an_obstacle_makes_no_energy(backend_of: Callable, how: tuple) -> None:
     """Neither does contact give more than it has taken, at any time."""
-    rows = [row for _, row in build_run(on_an_edge(*how), backend_of("f64", 1)).frames()]
-    energy, work = np.array([row.energy for row in rows]), np.cumsum([row.contact_work for row in rows])
-    turned = max(row.kinetic + row.elastic for row in rows)
-    assert (energy - energy[0]).max() < 1e-6 * turned and work.max() < 1e-6 * turned
-    assert np.ptp(energy) > 1e-2 * turned and work.min() < -1e-3 * turned
+    kept, contact, _ = worked(on_an_edge(*how), backend_of("f64", 1))
+    assert kept.max() < 1e-6 and contact.max() < 1e-6
+    assert kept.min() < -1e-2 and contact.min() < -1e-3
+
+
+@pytest.mark.parametrize(
+    "how",
+    [
+        ("jaws", 0.5, E, 0.3),
+        ("gripper", 1.0, 5 * E, 0.3),
+        pytest.param(("jaws", 0.0, 10 * E, 0.0), marks=pytest.mark.slow),
+        pytest.param(("jaws", 0.5, E, 0.3, 2), marks=pytest.mark.slow),
+    ],
+)
+def test_jaws_give_no_more_energy_than_their_work(backend_of: Callable, how: tuple) -> None:
+    """Where they stand still, the block comes to rest, and keeps most of what they have done."""
+    kept, contact, rows = worked(between_jaws(*how), backend_of("f64", 1))
+    assert kept.max() < 1e-3 and contact.max() < 1e-3
+    assert contact.min() < -1e-2
+    if how[0] == "gripper":
+        # It was lifted by 12 cells, and then set down.
+        height = np.array([row.potential for row in rows]) / (rows[0].mass * G * H)
+        assert height.max() - height[0] > 10 and abs(height[-1] - height[0]) < 1
+    else:
+        assert rows[-1].kinetic < 0.1 * max(row.kinetic for row in rows)
+        assert kept[-1] > -0.15
+
+
+@pytest.mark.slow
+def test_an_obstacle_makes_no_energy_in_3d(backend_of: Callable) -> None:
+    kept, contact, _ = worked(on_a_post_in_3d(), backend_of("f64", 1))
+    assert kept.max() < 1e-6 and contact.max() < 1e-6
+    assert kept.min() < -1e-2 and contact.min() < -1e-3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("right", "wrong"),
+    [
+        # Forces along the normals at nodes, not at the points of the surface; the lever of a point reversed.
+        ("force[b] -= push * normal[b]", "force[b] -= push * facing_there[b]"),
+        ("weight *= 1.0 + ti.static", "weight *= 1.0 - ti.static"),
+    ],
+)
+def test_a_planted_force_that_makes_energy_is_found(
+    tmp_path: Path, run_python: Callable, right: str, wrong: str
+) -> None:
+    """The wedge of the test above finds it."""
+    shutil.copytree(ROOT / "mpmcli", tmp_path / "mpmcli", ignore=shutil.ignore_patterns("__pycache__"))
+    file = tmp_path / "mpmcli" / "solver" / "contact" / "body_contact.py"
+    text = file.read_text(encoding="utf-8")
+    assert text.count(right) == 1
+    file.write_text(text.replace(right, wrong), encoding="utf-8")
+    test = ["-m", "pytest", "-q", "-p", "no:cacheprovider", f"{__file__}::test_an_obstacle_makes_no_energy[how2]"]
+    done = run_python(test, environment={"PYTHONPATH": str(tmp_path)}, check=False)
+    assert "contact.max() < 1e-6" in done.stdout and "1 failed" in done.stdout
 
 
 def test_contact_that_makes_energy_is_found(backend_of: Callable) -> None:
