@@ -361,6 +361,31 @@ def test_a_template_is_a_box_or_a_ball():
     assert 'sweep.toml:8: place.body: must be a box or a ball; "sand" is a polygon' in refusal(SWEEP, base)
 
 
+def test_elastic_bodies_that_would_not_separate_are_refused():
+    """With a grid of their own state at rest, unless the scene says that they stick; a single one may have it."""
+    two = BASE.replace('{ preset = "sand", friction_angle = 30.0 }', '"jelly"').replace('sampling = "jittered"\n', "")
+    total = '[solver]\nsolids = "total"\n'
+    said = (
+        'elastic bodies would not separate: "sand" and "stone" meet a quarter of a cell early, and slide '
+        'on each other without friction; set contact.default = "stick" if this will do, or leave solids out'
+    )
+    for contact in ("", '[contact]\ndefault = "separate"\n'):
+        assert refusal(BARE, two + total + contact) == [f"sweep.toml: trajectory 0: solver.solids: {said}"]
+    assert sweep_of(BARE, two + total + '[contact]\ndefault = "stick"\n').count == 1000
+    of_one = two[: two.index('[[bodies]]\nname = "stone"')] + total
+    assert sweep_of(BARE, of_one).count == 1000
+    either = varied('"solver.solids" = { choice = ["updated", "total"] }')
+    assert refusal(either, two) == [f"sweep.toml:6: vary.solver.solids: {said}"]
+
+
+def test_frames_without_particles_that_have_left_are_refused():
+    base = BASE.replace("[time]", 'walls = { x_max = "open" }\n[time]') + "[output]\ndrop_retired = true\n"
+    assert refusal(BARE, base) == [
+        "sweep.toml: trajectory 0: output.drop_retired: a trajectory of a dataset has the same particles in all "
+        "frames; leave it out"
+    ]
+
+
 def test_a_faulty_base_scene_speaks_for_itself():
     assert refusal(SWEEP, BASE.replace("end = 0.1", "end = -0.1")) == [
         "base.toml:6: time.end: must be greater than 0; found -0.1"

@@ -281,11 +281,7 @@ class Draw:
 
     def scene(self, laws: Laws) -> LoadedScene:
         """Return the complete scene; an InputError has one line per fault."""
-        loaded = parse_scene(self.data, laws=laws, source=self.source, directory=self.directory)
-        if loaded.scene.output.drop_retired:
-            said = "a trajectory of a dataset has the same particles in all frames; leave it out"
-            raise InputError(f"{self.source}: output.drop_retired: {said}")
-        return loaded
+        return parse_scene(self.data, laws=laws, source=self.source, directory=self.directory)
 
 
 def draw(sweep: Sweep, number: int, given: Mapping[str, Any] = MappingProxyType({})) -> Draw:

@@ -13,11 +13,11 @@ from pydantic import ValidationError
 from mpmcli.dataset.draw import PlacementError, draw, template_extent
 from mpmcli.dataset.sweep import ROUND_OFF, Placement, Sweep, SweepTable, is_number
 from mpmcli.errors import InputError
-from mpmcli.scene import parse_scene
+from mpmcli.scene import Scene, parse_scene
 from mpmcli.scene.load import read_scene, report, scene_problems
 from mpmcli.scene.material import Laws
 from mpmcli.scene.points import absence
-from mpmcli.scene.problem import Path, Problem, listed, nearest, path_text, problems_of, quoted, written
+from mpmcli.scene.problem import Path, Problem, listed, nearest, path_text, problems_of, quoted, several, written
 from mpmcli.scene.quantity import AXES, NUMBER_WORDS, dimension_of
 from mpmcli.scene.shapes import COMBINED
 from mpmcli.scene.toml_file import apply_overrides, key_parts, read_toml, set_value
@@ -211,7 +211,8 @@ def _scene_problems(sweep: Sweep, laws: Laws, set_by: dict[Path, Path], given: d
     """Return problems of trajectory 0, with `given` values, at their paths in the sweep file by `set_by`, if any."""
     drawn = draw(sweep, 0, given)
     found: list[Problem] = []
-    for problem in scene_problems(drawn.data, laws, drawn.directory):
+    scene, problems = scene_problems(drawn.data, laws, drawn.directory)
+    for problem in problems or _unfit(scene):
         path = problem.path
         for name, origins in (("bodies", drawn.origins), ("colliders", drawn.collider_origins)):
             if path[:1] == (name,) and len(path) > 1:
@@ -223,3 +224,17 @@ def _scene_problems(sweep: Sweep, laws: Laws, set_by: dict[Path, Path], given: d
         if new not in found:
             found.append(new)
     return found
+
+
+def _unfit(scene: Scene) -> Iterator[Problem]:
+    """Find what a run may have, and a trajectory of a dataset may not."""
+    if scene.output.drop_retired:
+        said = "a trajectory of a dataset has the same particles in all frames; leave it out"
+        yield Problem(("output", "drop_retired"), said)
+    elastic = [source.name for source in scene.sources if source.has_surface]
+    if scene.solver.solids == "total" and scene.contact.default != "stick" and len(elastic) > 1:
+        said = (
+            f"elastic bodies would not separate: {several(quoted(elastic))} meet a quarter of a cell early, and slide "
+            'on each other without friction; set contact.default = "stick" if this will do, or leave solids out'
+        )
+        yield Problem(("solver", "solids"), said)

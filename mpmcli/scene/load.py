@@ -167,9 +167,11 @@ def parse_scene(
     return LoadedScene(scene.model_copy(update=resolved), told, source)
 
 
-def scene_problems(data: dict[str, Any], laws: Laws, directory: str | PathLike[str] = ".") -> list[Problem]:
-    """Return everything for which `parse_scene` would refuse parsed TOML."""
-    return _validate(data, laws, directory)[1]
+def scene_problems(
+    data: dict[str, Any], laws: Laws, directory: str | PathLike[str] = "."
+) -> tuple[Scene | None, list[Problem]]:
+    """Return the scene of parsed TOML, None if it has no form, and everything for which `parse_scene` refuses it."""
+    return _validate(data, laws, directory)[:2]
 
 
 def _validate(
