@@ -12,8 +12,8 @@ from command import run_here
 from drawn_results import WATER, frame, header, row
 from test_plot import drawn
 
-from mpmcli.check.collider_work import work_of_colliders
-from mpmcli.check.result_check import ResultCheck, check_result
+from mpmcli.check.collider_work import unsure_work, work_of_colliders
+from mpmcli.check.result_check import ENERGY_SUSPECT, ResultCheck, check_result, energy_change
 from mpmcli.output import SegmentStore
 from mpmcli.scene.colliders import Collider
 
@@ -124,6 +124,26 @@ def test_the_work_of_a_collider_is_the_integral_of_its_power(dimension: int) -> 
         exact = -(np.cos(s) * np.cos(3 * s) + 2 * s + around).mean()
         errors.append(abs(work_of_colliders(rows, [collider])[-1] - exact))
     assert errors[0] < 2e-3 and errors[1] < errors[0] / 6
+
+
+def test_work_is_unsure_where_a_collider_starts_abruptly() -> None:
+    """At constant acceleration against a load that grows from zero with time: no energy from nothing is found there."""
+    motion = {"velocity": ["3*clamp(t-0.2,0,9)", "0*t"]}
+    shape = {"ball": {"center": [0.5, 0.5], "radius": 0.1}}
+    collider = Collider.model_validate({"name": "one", "shape": shape} | motion, context={"dimension": 2})
+    t = np.linspace(0.0, 1.0, 51)
+    moves = np.maximum(t - 0.2, 0.0)
+    means = np.diff(moves**2 / 2, prepend=0.0) * 50
+    rows = [
+        replace(row(time, 2), collider_force=((-mean, 0.0),), collider_torque=((0.0,),))
+        for time, mean in zip(t, means, strict=True)
+    ]
+    taken, work, unsure = moves**3, work_of_colliders(rows, [collider]), unsure_work(rows, [collider])
+    still = np.zeros(51)
+    assert energy_change(taken, still, still, work)[0].max() > ENERGY_SUSPECT
+    assert energy_change(taken, still, still, work + unsure)[0].max() < 1e-9
+    assert (np.abs(work - taken) <= unsure + 1e-12).all() and unsure[-1] < 1e-3 * work[-1]
+    assert energy_change(1.03 * taken, still, still, work + unsure)[0].max() > ENERGY_SUSPECT
 
 
 def test_a_load_that_is_no_number_is_found(tmp_path: Path) -> None:

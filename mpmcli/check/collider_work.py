@@ -12,11 +12,11 @@ from mpmcli.scene.expression import evaluate
 PARTS, AT_ONCE = 64, 1000
 
 
-def work_of_colliders(rows: Sequence[LedgerRow], colliders: Sequence[Collider]) -> np.ndarray:
+def work_of_colliders(rows: Sequence[LedgerRow], colliders: Sequence[Collider], *, sloped: bool = True) -> np.ndarray:
     """Return the work of colliders on the material up to each frame, (T,), J.
 
     Rows contain the mean load in the time before a frame. Within this time a load is linear, with the slope of the
-    means of the neighbouring rows, and the velocity is exact at the middles of `PARTS` parts.
+    means of the neighbouring rows, or constant, and the velocity is exact at the middles of `PARTS` parts.
     """
     times = np.array([row.time for row in rows])
     spans, work = np.diff(times), np.zeros(len(rows))
@@ -27,7 +27,7 @@ def work_of_colliders(rows: Sequence[LedgerRow], colliders: Sequence[Collider]) 
     for k, collider in enumerate(colliders):
         if collider.driven:
             loads = np.array([[*row.collider_force[k], *row.collider_torque[k]] for row in rows[1:]])
-            slopes = np.gradient(loads, middles, axis=0) if len(middles) > 1 else np.zeros_like(loads)
+            slopes = np.gradient(loads, middles, axis=0) if sloped and len(middles) > 1 else np.zeros_like(loads)
             forces = len(collider.motion.velocity)
             for first in range(0, len(middles), AT_ONCE):
                 own = slice(first, first + AT_ONCE)
@@ -44,3 +44,12 @@ def work_of_colliders(rows: Sequence[LedgerRow], colliders: Sequence[Collider]) 
                     power = (load[:, None] + slope[:, None] * offsets) * rate
                     work[1:][own] -= power.mean(axis=1) * spans[own]
     return np.cumsum(work)
+
+
+def unsure_work(rows: Sequence[LedgerRow], colliders: Sequence[Collider]) -> np.ndarray:
+    """Return how far the work up to each frame is unsure, (T,), J: as far as it depends on the slopes of the loads.
+
+    These are not known where a collider starts or stops abruptly.
+    """
+    sure, linear = (work_of_colliders(rows, colliders, sloped=sloped) for sloped in (False, True))
+    return np.cumsum(np.abs(np.diff(linear - sure, prepend=0.0)))

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mpmcli.check.collider_work import work_of_colliders
+from mpmcli.check.collider_work import unsure_work, work_of_colliders
 from mpmcli.check.finding import Finding, FrameFindings, Verdict, passes
 from mpmcli.check.result_entries import RUN_AGAIN, Entry, OpenedResult, check_order, open_entries
 from mpmcli.check.result_state import BLOWN_UP, CRUSHED, CrowdCheck, MomentumCheck, StateCheck, StretchCheck
@@ -253,12 +253,14 @@ def check_ledger(entries: Sequence[Entry], header: RunHeader, findings: FrameFin
     tell("mass", change, change > MASS_ERROR, True, what, fix)
     # With rigid bodies that move freely, colliders also do work on these.
     balanced = not header.driven and (not header.moved or _knows_work(rows, header))
-    work = work_of_colliders(rows, header.colliders) if balanced and header.moved else np.zeros(len(rows))
+    work = unsure = np.zeros(len(rows))
+    if balanced and header.moved:
+        work, unsure = work_of_colliders(rows, header.colliders), unsure_work(rows, header.colliders)
     energies = of["kinetic"], of["potential"], of["elastic"]
-    growth, lost = energy_change(*energies, work)
+    lost, growth = energy_change(*energies, work)[1], energy_change(*energies, work + unsure)[0]
     if "contact_work" in of:
         # Contact takes energy up and returns it. All else is known with the work of contact.
-        rest, _ = energy_change(*energies, work + np.cumsum(of["contact_work"]))
+        rest, _ = energy_change(*energies, work + unsure + np.cumsum(of["contact_work"]))
         growth = np.maximum(rest, growth - HELD)
     if not balanced:
         what = (
