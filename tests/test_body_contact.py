@@ -8,7 +8,7 @@ import contact_reference as contact
 import mpm_reference as reference
 import numpy as np
 import pytest
-from contact_scenes import DENSITY, LAMBDA, MU, SEPARATE, E, G, H, body, jelly, scene
+from contact_scenes import DENSITY, LAMBDA, MU, NU, SEPARATE, E, G, H, body, jelly, scene
 from solver_state import bodies_of, scene_of
 
 from mpmcli.errors import InputError
@@ -71,6 +71,8 @@ def test_elastic_bodies_have_layers_of_their_own() -> None:
     s = STICKS
     assert Layers.of(mixed).frictions(mixed).tolist() == [[s, s, s], [s, s, 0.3], [s, 0.3, s]]
     assert Layers.of(scene([a, b])) == Layers(2, False, 2, (0, 1))
+    welds = scene([a, b | {"material": metal(surface_friction="stick")}])
+    assert Layers.of(scene([a, b | {"material": metal()}])).numbers == (0, 1) and Layers.of(welds).numbers == (1, 0)
     assert Layers.of(scene([a, water])) == Layers(2, True, 2, (1, 0))
     alone, glued = Layers.of(scene([a])), Layers.of(scene([a, b], contact={"default": "stick"}))
     assert (alone.count, alone.separate, glued.count, glued.separate) == (1, True, 1, False)
@@ -601,3 +603,49 @@ def test_a_block_pushes_another_through_a_periodic_face(backend_of: Callable) ->
     found, last = compare((pushed(0), pushed(11)), (11, 0), lambda: backend_of("f64", 1))
     assert found < 1e-8
     assert last.velocity[last.body == 1, 0].mean() > 0.3
+
+
+def metal(**more: object) -> dict:
+    """Return a metal whose particles carry its surface."""
+    own = {"law": "von_mises", "density": DENSITY, "youngs_modulus": 1e7, "poissons_ratio": NU, "yield_stress": 2.5e4}
+    return own | {"hardening_modulus": 5e3, "surface_friction": 0.1} | more
+
+
+def bar_and_block(end: float, **moves: object) -> Scene:
+    """A bar of 20 x 8 cells, and a block of 20 x 16 cells two cells behind it."""
+    bar = body("bar", [10.3, 12], [30.3, 20], material=metal(), **moves)
+    return scene([bar, body("block", [32.3, 8], [52.3, 24], material=metal())], 0.1, end=end, frames=20)
+
+
+def test_metal_dents_and_parts(backend_of: Callable) -> None:
+    """At 0.04 of its wave speed, 8 times that at yield: it leaves with the little that stays elastic, 0.02 to 0.12."""
+    pace = 4.0
+    frames = list(build_run(bar_and_block(0.2, velocity=[pace, 0.0]), backend_of("f64", 1)).frames())
+    found = np.array([[frame.velocity[frame.body == k, 0].mean() for k in (0, 1)] for frame, _ in frames])
+    assert 0.02 * pace < found[-1, 1] - found[-1, 0] < 0.12 * pace
+    assert found[-1] == pytest.approx(found[-4], abs=1e-6 * pace)
+    assert found @ [1, 2] == pytest.approx(np.full(len(frames), pace), rel=1e-9)
+    energy = np.array([row.energy for _, row in frames])
+    assert energy.max() <= energy[0] * (1 + 1e-6) and energy[-1] < 0.5 * energy[0]
+    place, whose = frames[-1][0].position, frames[-1][0].body
+    assert place[whose == 1, 0].min() - place[whose == 0, 0].max() > 0.1 * H
+
+
+def test_metal_carries_its_surface_along(backend_of: Callable) -> None:
+    """A bar that turns by a radian turns the normals of its particles, and keeps their depths below its faces."""
+    asked = bar_and_block(0.25, velocity_gradient=[[0.0, -4.0], [4.0, 0.0]])
+    run = build_run(asked, backend_of("f64", 1))
+    *_, (frame, _) = run.frames()
+    arrays = run.groups[0].arrays
+    at_rest = rest_surface(asked.bodies[0], sample_bodies(asked)[0], H)
+    found = arrays.carried.to_numpy()[np.argsort(arrays.id.to_numpy()[: len(frame.position)])][: len(at_rest)]
+    places = [
+        x[frame.body == 0] - x[frame.body == 0].mean(axis=0)
+        for x in (np.concatenate([own.position for own in sample_bodies(asked)]), frame.position)
+    ]
+    (x, y), (u, v) = places[0].T, places[1].T
+    angle = math.atan2((x * v - y * u).sum(), (x * u + y * v).sum())
+    turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+    assert angle == pytest.approx(1.0, abs=0.02)
+    assert found[:, :2] == pytest.approx(at_rest[:, :2] @ turn.T, abs=0.02)
+    assert found[:, 2] == pytest.approx(at_rest[:, 2], rel=0.02)

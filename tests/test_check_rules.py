@@ -149,8 +149,15 @@ def test_a_scene_that_does_not_set_contact(more: dict, fires: bool) -> None:
 def test_solids_that_yield_weld() -> None:
     metal = {"law": "von_mises", "density": 1000.0, "youngs_modulus": 1e5, "poissons_ratio": 0.3, "yield_stress": 1e3}
     low, high = block("low", [0.25, 0.0], [0.5, 0.25]), block("high", [0.25, 0.5], [0.5, 0.75])
-    for material, welds in ((metal, True), (SOLID, True), (FLUID, False)):
-        findings = found("weld", [low | {"material": metal}, high | {"material": material}])
+    slides = metal | {"surface_friction": 0.1}
+    for one, material, welds in (
+        (metal, metal, True),
+        (metal, SOLID, True),
+        (metal, FLUID, False),
+        (slides, slides, False),
+        (slides, metal, True),
+    ):
+        findings = found("weld", [low | {"material": one}, high | {"material": material}])
         assert [finding.severity for finding in findings] == ["note"] * welds
 
 

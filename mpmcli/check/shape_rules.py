@@ -122,10 +122,12 @@ def _sticking(facts: SceneFacts) -> Iterator[Finding]:
 
 def _welding(facts: SceneFacts) -> Iterator[Finding]:
     """Yield solids that weld on contact, because those that yield share one velocity field with all others."""
-    yielding = [one.name for one in facts.scene.sources if one.material.law in WELDING]
-    if yielding and len(yielding) + sum(one.has_surface for one in facts.scene.sources) > 1:
+    scene = facts.scene
+    yielding = [one.name for one in scene.sources if one.material.law in WELDING and not scene.separates(one)]
+    if yielding and len(yielding) + sum(one.has_surface for one in scene.sources) > 1:
         what = f"The material of {several(quoted(yielding))} yields: solids that it meets weld to it, and do not slide."
-        yield Finding("note", "weld", what, "Nothing needs to be done.", len(yielding), yielding[0])
+        fix = "Nothing needs to be done; with a surface_friction, metal and clay separate."
+        yield Finding("note", "weld", what, fix, len(yielding), yielding[0])
 
 
 def _walls(facts: SceneFacts) -> Iterator[Finding]:

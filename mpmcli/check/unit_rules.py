@@ -94,7 +94,8 @@ def _heap(facts: SceneFacts) -> Iterator[Finding]:
 
 def _welds(facts: SceneFacts) -> Iterator[Finding]:
     """Yield plastic solids, which share a velocity field and join where they meet."""
-    plastic = (one for one in facts.bodies if one.law.deformation == "F" and one.law.projects)
+    shared = (one for one in facts.bodies if not facts.scene.separates(one.body))
+    plastic = (one for one in shared if one.law.deformation == "F" and one.law.projects)
     solid = [one.name for one in plastic if one.body.material.law != "sand"]
     if len(solid) > 1:
         what = f"The bodies {several(quoted(solid))} can flow: where they meet they stick, and become one."

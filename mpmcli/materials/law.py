@@ -125,6 +125,7 @@ class Law(ABC):
         self.internal: tuple[Internal, ...] = self.parameters.internal_in(dimension)
         ratios = [getattr(member, "poissons_ratio", 0.0) for member in members]
         self.locks = max(ratios, default=0.0) > NEARLY_INCOMPRESSIBLE and not self.flows
+        self.surfaced = any(member.has_surface for member in members)
 
     @property
     def terms(self) -> tuple[tuple[str, bool], ...]:

@@ -39,10 +39,21 @@ class VonMisesParameters(HenckyParameters):
         Field(0.0, description="Growth of the yield stress per plastic strain, Pa; 0 is perfectly plastic.")
     )
 
+    surface_friction: NotNegative | Literal["stick"] = Field(
+        "stick",
+        description='Coefficient of Coulomb friction with bodies that separate from it, as of elastic laws; "stick": '
+        "solids that it meets weld to it.",
+    )
+
     internal: ClassVar[tuple[Internal, ...]] = (
         Internal("plastic_strain", 0.0, "Equivalent plastic strain, dimensionless."),
         Internal("elastic_strain_zz", 0.0, "Elastic Hencky strain out of the plane, dimensionless.", (2,)),
     )
+
+    @property
+    def has_surface(self) -> bool:
+        """Whether it has a coefficient of friction."""
+        return self.surface_friction != "stick"
 
     def resolve(self, bounds: SceneBounds) -> tuple[Self, list[str]]:
         """Replace "auto" by the softest modulus that the scene allows and whose yield strain is small."""

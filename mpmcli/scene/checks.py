@@ -399,8 +399,8 @@ def _paired(scene: Scene) -> Iterator[Problem]:
             yield Problem(path, f"names the bodies of contact.pairs[{earlier}]; leave one of them out")
         for name in pair.between:
             if pair.friction != "stick" and name in sources and not sources[name].has_surface:
-                said = f'"{name}" cannot separate: only a body of an elastic law, and not one of points, can; '
-                yield Problem(path, said + 'give friction = "stick"')
+                said = f'"{name}" cannot separate: only a body of an elastic law, or of metal with a surface_friction, '
+                yield Problem(path, said + 'and not one of points, can; give friction = "stick"')
 
 
 def _total(scene: Scene) -> Iterator[Problem]:

@@ -151,6 +151,11 @@ class MaterialParameters(BaseModel):
         """Return the internal variables that a particle has in 2D or 3D."""
         return tuple(variable for variable in cls.internal if dimension in variable.dimensions)
 
+    @property
+    def has_surface(self) -> bool:
+        """Whether the particles of a body may represent its surface, at which it separates from others."""
+        return self.elastic
+
     def resolve(self, bounds: SceneBounds) -> tuple[Self, list[str]]:
         """Return these parameters with every "auto" replaced, and a sentence for each choice."""
         return self, []

@@ -296,8 +296,8 @@ class Body(Table):
 
     @property
     def has_surface(self) -> bool:
-        """Whether particles can represent its surface: it stays elastic, and its shape is known."""
-        return self.material.elastic and self.shape.points is None
+        """Whether particles can represent its surface: its material keeps one, and its shape is known."""
+        return self.material.has_surface and self.shape.points is None
 
 
 def _no_repeats(fields: tuple[str, ...]) -> tuple[str, ...]:

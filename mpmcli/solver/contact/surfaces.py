@@ -1,9 +1,9 @@
 """Surface data of bodies with their own velocity fields, near nodes where they may be in contact.
 
 Each particle stores the depth D below the nearest face of its body at rest, and the normal N of that face. Under F they
-become d = D / |F^-T N| and n = F^-T N / |F^-T N|, and x + d n is a point of the surface. Particles with a surface point
-("shown" particles) are inserted into bins, one for each node at which stencils begin. Contact with separating walls and
-colliders uses their exact distance.
+become d = D / |F^-T N| and n = F^-T N / |F^-T N|, and x + d n is a point of the surface. Where plastic flow changes F,
+particles store d and n. Particles with a surface point ("shown" particles) are inserted into bins, one for each node at
+which stencils begin. Contact with separating walls and colliders uses their exact distance.
 """
 
 from collections.abc import Sequence
@@ -567,7 +567,9 @@ class BodySurfaces:
                 N = ti.Vector.zero(float, d)
                 for c in ti.static(range(d)):
                     N[c] = group.carried[p][c]
-                n = group.stored(p).inverse().transpose() @ N
+                n = N
+                if ti.static(not group.law.projects):
+                    n = group.stored(p).inverse().transpose() @ N
                 size = n.norm()
                 depth = group.carried[p][d] / size
                 if depth < band:

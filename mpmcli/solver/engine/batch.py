@@ -110,7 +110,7 @@ class Batch:
                 has_wall_friction=slips_in(kind.settings, kind.rough),
                 comes_and_goes=kind.inflow.any,
                 layers=kind.layers.count,
-                surfaced=kind.layers.separate and law.elastic,
+                surfaced=kind.layers.separate and law.surfaced,
             )
             for law, shares, capacity, bodies, forces in zip(
                 kind.members, averaged, kind.particles, kind.bodies, kind.drives.forces, strict=True

@@ -336,10 +336,10 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
                 total=scene.solver.solids == "total",
                 has_wall_friction=slips_in(scene.solver, rough_faces(scene)),
                 comes_and_goes=scene.comes_and_goes,
-                surfaced=separate and laws()[name].elastic,
+                surfaced=separate and member.surfaced,
             ),
         )
-        for name, shares in zip(scene.laws, averaged, strict=True)
+        for name, member, shares in zip(scene.laws, members, averaged, strict=True)
     )
     # The widest field is a matrix; sources and keys are integers.
     widest = max(size for group in groups for size in group.fields.values())
@@ -365,7 +365,7 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
     tables = len(groups) * TileOrder.bytes_needed(blocks if sparse else all_tiles, backend.threads)
     if sparse:
         tables += SparseGrid.table_bytes(all_tiles, blocks, dimension)
-    surfaced = [in_steps(counts[law.name]) for law in members if separate and law.elastic]
+    surfaced = [in_steps(counts[law.name]) for law in members if separate and law.surfaced]
     if surfaced:
         shown_bytes = real * (2 * dimension + 1)
         tables += BodySurfaces.bytes_needed(nodes, all_tiles, surfaced, shown_bytes, on_cpu=backend.on_cpu)

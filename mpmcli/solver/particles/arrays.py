@@ -96,8 +96,9 @@ class ParticleArrays:
             not `total`.
         slip: slip of a particle on the wall that pushes it, (n) Vector(d), m; stored with friction
             (`has_wall_friction`), see `total_solids`.
-        carried: (n) Vector(d + 1), the normal to the nearest face of the body at rest, and the depth below it, m;
-            stored in groups whose bodies may have their own layers (`surfaced`), see `contact.surfaces`.
+        carried: (n) Vector(d + 1), the normal to the nearest face of the body, and the depth below it, m, at rest or,
+            if the law projects F, at present; stored in groups whose bodies may have their own layers (`surfaced`), see
+            `contact.surfaces`.
         layers: number of layers of the grid.
         layer: per row of the table, the layer of nodes of the body.
         activity: (n) int, status of each particle: waiting, active, retired or blocked (`particles.sort`); None if all
@@ -337,6 +338,18 @@ class ParticleArrays:
             return F
         else:
             return 1.0 + self.J_minus_1[p]
+
+    @ti.func
+    def carry_surface(self, p: int, C: ti.template(), dt: float):
+        """Change the normal and the depth of particle p, whose law projects F, to (I + dt C)^-T n and D, over |n|."""
+        d = ti.static(self.dimension)
+        N = ti.Vector.zero(float, d)
+        for c in ti.static(range(d)):
+            N[c] = self.carried[p][c]
+        n = (ti.Matrix.identity(float, d) + dt * C).inverse().transpose() @ N
+        for c in ti.static(range(d)):
+            self.carried[p][c] = n[c] / n.norm()
+        self.carried[p][d] /= n.norm()
 
     @ti.func
     def seen(self, p: int):

@@ -272,7 +272,7 @@ def advance_range(
             old_moment = node_rows_of(moments, d, width, kept, d, lane)
             (own,) = ti.static((Receiver(place, remainder, v, C, before, constants, share, lacking),))
             (sums,) = ti.static((NodeSums(distance, velocity, moment, old_velocity, old_moment),))
-            v_after, C_after, inside, left, out, state, growth, rate = take_back(
+            v_after, C_after, inside, left, out, state, growth, rate, slope = take_back(
                 particles, group, own, sums, dt, gravity_step
             )
             set_vector(speeds, 0, v_after, lane)
@@ -282,6 +282,9 @@ def advance_range(
                 set_vector(remainders, 0, left, lane)
             set_deformation(group, after, state, lane)
             beyond[lane], growths[0, lane], rates[lane] = out, growth, rate
+            if ti.static(group.surfaced and group.law.projects):
+                if lane < count:
+                    group.carry_surface(begin + lane, slope, dt)
 
         # Written so that a NaN is not sound: the particle then does not move, and no later step writes outside the
         # grid.

@@ -188,6 +188,7 @@ def take_back(
         deformation: J - 1 or F - I.
         growth: increase of ln J in the step, if the group is `evened`.
         rate: rate of deformation, 1/s (see `deformation_rate`).
+        slope: gradient of the velocity, by which F changes, 1/s.
     """
     grid, d = ti.static((particles.grid, group.dimension))
     C = centred(grid, sums.distance, sums.velocity, sums.moment).transpose()
@@ -217,7 +218,7 @@ def take_back(
             after = even(own.deformation, own.missing)
             growth = log_volume(dt * C)
         after = deformed_gradient(after, C, dt)
-    return v, affine, place, remainder, beyond, after, growth, rate
+    return v, affine, place, remainder, beyond, after, growth, rate, C
 
 
 @ti.func

@@ -168,7 +168,7 @@ class ParticleUpdate:
         old_velocity, old_moment = columns(all_sums, moments, kept, d)
         (own,) = ti.static((Receiver(x, remainder, v, C, deformation, constants, share, missing),))
         (sums,) = ti.static((NodeSums(distance, velocity, moment, old_velocity, old_moment),))
-        v_after, C_after, inside, left, beyond, after, growth, rate = take_back(
+        v_after, C_after, inside, left, beyond, after, growth, rate, slope = take_back(
             self, group, own, sums, dt, gravity_step
         )
         for c in ti.static(range(d)):
@@ -184,6 +184,8 @@ class ParticleUpdate:
             group.J_minus_1[p] = after
         if ti.static(group.evened):
             group.growth[p] = growth
+        if ti.static(group.surfaced and group.law.projects):
+            group.carry_surface(p, slope, dt)
 
         # Written so that a NaN is not sound: the particle then does not move, and no later step writes outside the
         # grid.
