@@ -350,13 +350,13 @@ def test_a_collider_at_speed_limits_the_step(backend_of: Callable) -> None:
 
 @pytest.mark.parametrize("dimension", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_turning_colliders_are_where_their_motion_says(backend_of: Callable, dimension: int) -> None:
-    """A body that sticks in a container that turns and moves goes with it: each particle to 1e-3 of a cell in f64."""
+    """A body that is held by a shape that turns and moves goes with it: each particle to 1e-3 of a cell in f64."""
     h, d = 0.1, dimension
     turn = {"angular_velocity": "3 + 4*t", "velocity": ["0.2*cos(5*t)", *[0.1] * (d - 1)], "pivot": [0.9] * d}
     if d == 3:
         turn["axis"] = [1.0, -2.0, 0.5]
     ball = {"ball": {"center": [1.0] * d, "radius": 2.6 * h}}
-    held = {"name": "c", "shape": {"ball": {"center": [1.0] * d, "radius": 5 * h}}, "wall": "stick"} | turn
+    held = {"name": "c", "shape": {"ball": {"center": [1.0] * d, "radius": 5 * h}}, "wall": "hold"} | turn
     # In 2D, with the post, the kernel is that of the scenes above.
     post = {"name": "post", "shape": {"box": {"min": [0.0] * d, "max": [0.1] * d}}}
     scene = scene_of(

@@ -133,8 +133,9 @@ def test_the_plan_counts_what_colliders_need(backend_of: Callable, dimension: in
     plain = scene_with("solid", dimension=dimension)
     plain = plain.model_copy(update={"solver": plain.solver.model_copy(update={"solids": solids})})
     scene, backend = with_colliders(plain, [union, box]), backend_of("f32", 1)
-    colliders = build_run(scene, backend).batch.device.colliders
-    own, taken = vars(colliders).values(), colliders.loads.taken
+    device = build_run(scene, backend).batch.device
+    own, taken = [*vars(device.colliders).values()], device.colliders.loads.taken
+    own += vars(device.points).values() if device.points else []
     sizes = [4 * entry_count(field) * field.shape[0] for field in own if isinstance(field, ti.Field)]
     more = make_plan(scene, backend).device_bytes - make_plan(plain, backend).device_bytes
     assert more == sum(sizes) + 8 * entry_count(taken) * taken.shape[0] > 0

@@ -16,9 +16,9 @@ from mpmcli.boundaries.loads import Loads
 from mpmcli.boundaries.rows import Rows
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
-from mpmcli.scene.colliders import Collider
+from mpmcli.scene.colliders import Collider, Plane
 from mpmcli.scene.expression import evaluate
-from mpmcli.scene.primitives import Box, Polygon
+from mpmcli.scene.primitives import Ball, Box, Capsule, Polygon
 from mpmcli.scene.quantity import AXES
 from mpmcli.scene.surface import form_surface, surface_points
 
@@ -26,6 +26,11 @@ from mpmcli.scene.surface import form_surface, surface_points
 # of a cell inside and three quarters outside: then fluids neither enter nor lose pressure, and rough surfaces stick
 # (docs/theory.md, 3.8). A little more than 0.75, so that rounding does not matter for nodes at that distance.
 REACH = 0.76
+# The same if the surface acts at its points (`contact.collider_points`): nodes this deep inside, and deeper, take part
+# in no point, and keep back what got in. Nodes inside a surface that sticks follow the gradient of the velocity beside.
+DEEP, DEEP_STICKING = -0.76, -1.25
+# A surface acts at nodes all the same where the collider is thin: PROBE cells below it, its distance is above -WITHIN.
+PROBE, WITHIN = 0.75, 0.2
 # Codes of the conditions of surfaces.
 SLIP, STICK, SEPARATE, HOLD = range(4)
 WALLS = {"slip": SLIP, "stick": STICK, "separate": SEPARATE, "hold": HOLD}
@@ -53,6 +58,7 @@ class ColliderKind:
     samples: int
     free: tuple[int, ...] = ()  # indices of the colliders that move freely
     points: int = 0  # number of points on the surfaces of free colliders
+    touched: bool = False  # whether any does not hold
 
     @staticmethod
     def of(scene: Scene) -> "ColliderKind":
@@ -66,12 +72,13 @@ class ColliderKind:
             sum(samples_of(collider.form, h)[0].size for collider in found if form_code(collider) == GRID),
             tuple(k for k, collider in enumerate(found) if collider.free),
             sum(len(contact_points(collider, h)) for collider in found if collider.free),
+            any(collider.wall != "hold" for collider in found),
         )
 
     def bytes_needed(self, dimension: int, rows: int, real: int, *, at_rest: bool) -> int:
         """Return the bytes of all fields on the device; `rows` of nodes are along the last axis, see `Colliders`."""
         d, sums = dimension, 9 if dimension == 2 else 27
-        own = self.count * (4 * (4 + d + (self.samples > 0)) + real * (1 + 4 * d + (2 + at_rest) * d * d))
+        own = self.count * (4 * (5 + d + (self.samples > 0)) + real * (1 + 4 * d + (2 + at_rest) * d * d))
         own += self.numbers * real + 4 * (self.count > 0)
         loads = Loads.bytes_needed(self.count, dimension, rows)
         points = self.points * (36 + 32 * dimension)
@@ -79,11 +86,13 @@ class ColliderKind:
 
     def joined(self, other: "ColliderKind") -> "ColliderKind | None":
         """Return the kind that has room for both, or None if they need different kernels."""
-        if (self.moving, self.free, self.count > 0) != (other.moving, other.free, other.count > 0):
+        if any(getattr(self, name) != getattr(other, name) for name in ("moving", "free", "touched")):
+            return None
+        if (self.count > 0) != (other.count > 0):
             return None
         forms = tuple(sorted({*self.forms, *other.forms}))
         rooms = (max(getattr(self, name), getattr(other, name)) for name in ("count", "numbers", "samples"))
-        return ColliderKind(forms, self.moving, *rooms, self.free, max(self.points, other.points))
+        return ColliderKind(forms, self.moving, *rooms, self.free, max(self.points, other.points), self.touched)
 
 
 def form_code(collider: Collider) -> int:
@@ -105,6 +114,16 @@ def numbers_of(collider: Collider, h: float) -> list[float]:
 def contact_points(collider: Collider, h: float) -> np.ndarray:
     """Return points on the surface of a free collider, relative to its centre, (n, d), one per cell of h metres."""
     return surface_points(form_surface(collider.form), h) - np.array(collider.center)
+
+
+def slender(collider: Collider, h: float) -> bool:
+    """Return whether a collider may be thinner than a cell of h metres somewhere; rigid bodies never count as thin."""
+    form = collider.form
+    if collider.free or collider.side == "inside" or isinstance(form, Plane):
+        return False
+    if isinstance(form, Box):
+        return min(np.subtract(form.max, form.min)) < h
+    return not isinstance(form, Ball | Capsule) or 2 * form.radius < h
 
 
 def reach_of(collider: Collider, h: float) -> np.ndarray:
@@ -130,6 +149,8 @@ class Colliders:
         loads: loads of the material on each collider, about its pivot.
         layered: whether some bodies touch separating colliders by their surfaces; then these colliders act here only
             if `own`, a number or a variable of a kernel, is 0.
+        support: half the width of the kernel of a node, cells, if surfaces that do not hold act at their points in
+            layer 0, else 0.
         at_rest: whether nodes are places of material at rest: colliders, which all hold, act where they were at time 0.
         deterministic: whether the nodes of a row are summed in order; then `given` is the impulse of each node on each
             collider in a step, N s, else None.
@@ -151,7 +172,7 @@ class Colliders:
         d, n = dimension, runs * kind.count
         self.kind, self.dimension, self.shape, self.first, self.on_cpu = kind, d, tuple(shape), first, on_cpu
         self.capacity, self.run, self.spacing = kind.count, 0, 0.0
-        self.layered, self.own, self.at_rest = False, 0, at_rest
+        self.layered, self.own, self.at_rest, self.support = False, 0, at_rest, 0.0
         self.real = np.float64 if ti.lang.impl.current_cfg().default_fp == ti.f64 else np.float32
         self.loads = Loads(kind.count, shape, runs, on_cpu=on_cpu)
         self.distances = tuple((code, DISTANCES[FORMS[code]](d)) for code in kind.forms if code != GRID)
@@ -166,6 +187,8 @@ class Colliders:
         self.form, self.wall = ti.field(int, shape=n), ti.field(int, shape=n)
         self.begin, self.side = ti.field(int, shape=n), ti.field(int, shape=n)
         self.friction = ti.field(float, shape=n)
+        # Whether it may be thin somewhere, 1 or 0.
+        self.slender = ti.field(int, shape=n)
         # Axes along which a holding collider does not hold, 1 or 0.
         self.lets = ti.Vector.field(d, int, shape=n)
         # Position of the pivot relative to the lower corner, m, rotation, and bounds of the nodes that it may act on.
@@ -178,8 +201,8 @@ class Colliders:
         self.velocity = ti.Vector.field(d, float, shape=n)
         self.turning = ti.Matrix.field(d, d, float, shape=n)
         self.count, self._counts = ti.field(int, shape=runs), [0] * runs
-        fields = [self.form, self.wall, self.begin, self.side, self.friction, self.lets, self.place, self.turned]
-        fields += [self.reach, self.velocity, self.turning] + ([self.sample] if self.grids else [])
+        fields = [self.form, self.wall, self.begin, self.side, self.friction, self.slender, self.lets, self.place]
+        fields += [self.turned, self.reach, self.velocity, self.turning] + ([self.sample] if self.grids else [])
         fields += [self.carried] if at_rest else []
         self._rows, self._count = Rows(*fields), Rows(self.count)
         self.deterministic = deterministic
@@ -198,7 +221,8 @@ class Colliders:
             place, turned = collider.motion.pose(0.0)
             held = [int(collider.axes is not None and axis not in collider.axes) for axis in AXES[: self.dimension]]
             side = -1 if collider.side == "inside" else 1
-            row = [form_code(collider), WALLS[collider.wall], used, side, collider.friction, held]
+            thin = int(slender(collider, h))
+            row = [form_code(collider), WALLS[collider.wall], used, side, collider.friction, thin, held]
             row += [place - origin, turned, reach_of(collider, h), still[0], still]
             rows.append(row + [sampled] * self.grids + [np.eye(self.dimension)] * self.at_rest)
             used += len(numbers)
@@ -253,22 +277,31 @@ class Colliders:
                 self.loads.taken[row] = self.loads.taken[row] + total
 
     @ti.func
-    def constrain(self, node: ti.template(), velocity: ti.template(), mass: float):
-        """Return the velocity, m/s, of a node of a mass, kg, after the colliders have acted; add to their loads."""
+    def constrain(self, node: ti.template(), velocity: ti.template(), mass: float, spline: ti.template()):
+        """Return the velocity, m/s, of a node of a mass, kg, after the colliders have acted; add to their loads.
+
+        Also return the share of its kernel outside of colliders, see `free_share`.
+        """
         d = ti.static(self.dimension)
-        result, x = ti.Vector.zero(float, d), self.place_of(node)
+        result, x, free, held = ti.Vector.zero(float, d), self.place_of(node), 1.0, False
         for a in ti.static(range(d)):
             result[a] = velocity[a]
         for k in range(self.count[self.run]):
             i = self.run * self.capacity + k
             arm = x - self.place[i]
-            near = self.covers(i, x)
+            near = self.covers(i, x, self.beyond())
             if ti.static(self.layered):
                 near = near and (self.own == 0 or self.wall[i] != SEPARATE)
             if near:
                 for face in range(self.faces_of(i)):
                     phi, normal = self.distance(i, arm, face)
-                    if phi <= self.reach_of_surface(i):
+                    pointed = False
+                    if ti.static(self.support > 0):
+                        pointed = self.own == 0 and self.acts_by_points(i, arm, face, phi, normal)
+                        if pointed:
+                            free *= spline.share_below(phi / self.spacing)
+                    if phi <= self.reach_of_surface(i, pointed):
+                        held = True
                         now = self.arm_now(i, arm)
                         after, _grip = self.met(i, now, normal, result)
                         if ti.static(self.deterministic):
@@ -280,7 +313,25 @@ class Colliders:
                             self.loads.take(self.run, node, k, mass * (result - after), now)
                         for a in ti.static(range(d)):
                             result[a] = after[a]
-        return result
+        return result, ti.select(held, -free, free)
+
+    @ti.func
+    def free_share(self, node: ti.template(), spline: ti.template()):
+        """Return the share of the kernel of a node that is outside of colliders which do not hold."""
+        x, free = self.place_of(node), 1.0
+        for k in range(self.count[self.run]):
+            i = self.run * self.capacity + k
+            if self.wall[i] != HOLD and self.covers(i, x, self.beyond()):
+                for face in range(self.faces_of(i)):
+                    phi, normal = self.distance(i, x - self.place[i], face)
+                    if self.acts_by_points(i, x - self.place[i], face, phi, normal):
+                        free *= spline.share_below(phi / self.spacing)
+        return free
+
+    @ti.func
+    def beyond(self):
+        """Return how far beyond its reach a collider cuts the kernels of nodes, m."""
+        return ti.static(max(self.support - REACH, 0.0)) * self.spacing
 
     @ti.func
     def arm_now(self, i: int, arm: ti.template()):
@@ -291,9 +342,21 @@ class Colliders:
         return result
 
     @ti.func
-    def reach_of_surface(self, i: int):
+    def acts_by_points(self, i: int, arm: ti.template(), face: int, phi: float, normal: ti.template()):
+        """Return whether the surface of collider i acts at its points near a node at the distance phi, m."""
+        result, h = self.wall[i] != HOLD, self.spacing
+        if self.slender[i] == 1 and ti.abs(phi) <= REACH * h:
+            below, _normal = self.distance(i, arm - (phi + PROBE * h) * normal, face)
+            result = result and below <= -WITHIN * h
+        return result
+
+    @ti.func
+    def reach_of_surface(self, i: int, pointed: bool):
         """Return the distance outside its surface up to which collider i acts on nodes, m."""
-        return ti.select(self.wall[i] == HOLD, HELD_OUTSIDE, REACH) * self.spacing
+        reach = REACH
+        if pointed:
+            reach = ti.select(self.wall[i] == STICK, DEEP_STICKING, DEEP)
+        return ti.select(self.wall[i] == HOLD, HELD_OUTSIDE, reach) * self.spacing
 
     @ti.func
     def place_of(self, node: ti.template()):
@@ -304,11 +367,11 @@ class Colliders:
         return x
 
     @ti.func
-    def covers(self, i: int, x: ti.template()):
-        """Return whether collider i may act at a position."""
+    def covers(self, i: int, x: ti.template(), more: float = 0.0, axes: ti.template() = 3):
+        """Return whether collider i may act within `more` metres of a position, judged by the first `axes` axes."""
         arm, near = x - self.place[i], True
-        for a in ti.static(range(self.dimension)):
-            near = near and arm[a] >= self.reach[i][0, a] and arm[a] <= self.reach[i][1, a]
+        for a in ti.static(range(min(axes, self.dimension))):
+            near = near and arm[a] >= self.reach[i][0, a] - more and arm[a] <= self.reach[i][1, a] + more
         return near
 
     @ti.func

@@ -197,7 +197,7 @@ class PolygonDistance(Distance):
     @ti.func
     def at(self, numbers: ti.template(), first: int, y: ti.template()):
         count = ti.cast(numbers[first], int)
-        square, inside = 1e30, False
+        square, inside, beside = 1e30, False, False
         nearest = y
         normal = first_axis(y)
         last = first + 2 * count - 1
@@ -214,13 +214,15 @@ class PolygonDistance(Distance):
                 # The right of the edge is outside.
                 size = ti.sqrt(ex * ex + ey * ey)
                 normal[0], normal[1] = ey / size, -ex / size
+                # Beside an edge its normal is exact, also for a node on it, whose offset is only rounding.
+                beside = t > 0.0 and t < 1.0
             if (ay > y[1]) != (by > y[1]):
                 if y[0] < ax + (y[1] - ay) * ex / ey:
                     inside = not inside
             ax, ay = bx, by
         away = ti.sqrt(square)
         phi = -away if inside else away
-        if away > TINY:
+        if away > TINY and not beside:
             normal = nearest / phi
         return phi, normal
 

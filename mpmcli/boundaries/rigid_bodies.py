@@ -8,7 +8,7 @@ to single precision, because many nodes add to a row at once.
 
 import numpy as np
 
-from mpmcli.boundaries.colliders import HELD, LOOSE, REACH, Colliders
+from mpmcli.boundaries.colliders import Colliders
 from mpmcli.boundaries.doubles import double_field
 from mpmcli.boundaries.rigid_motion import RigidMotion
 from mpmcli.quick_taichi import ti
@@ -65,52 +65,6 @@ class RigidBodies(RigidMotion):
         return np.hstack([self.pose.to_numpy()[own], rates]), taken
 
     # Rounds.
-
-    @ti.func
-    def near(self, node: ti.template(), axes: ti.template()):
-        """Return 1 if a body that is not settled may act on a node, judged by the first `axes` axes, else 0."""
-        x, near = self.colliders.place_of(node), 0
-        for j in range(self.count):
-            i = self.collider_of(self.run, j)
-            own = 1 - self.settled[self.run * self.count + j]
-            for a in ti.static(range(axes)):
-                arm = x[a] - self.colliders.place[i][a]
-                if arm < self.colliders.reach[i][0, a] or arm > self.colliders.reach[i][1, a]:
-                    own = 0
-            near = ti.max(near, own)
-        return near
-
-    @ti.func
-    def meet(self, node: ti.template(), velocity: ti.template(), mass: float):
-        """Add to the sums the impulse that a node with this velocity, m/s, and mass, kg, would give to each body."""
-        d = ti.static(self.dimension)
-        x, v = self.colliders.place_of(node), ti.Vector.zero(float, d)
-        for a in ti.static(range(d)):
-            v[a] = velocity[a]
-        for j in range(self.count):
-            b = self.run * self.count + j
-            i = self.collider_of(self.run, j)
-            arm = x - self.colliders.place[i]
-            if self.settled[b] == 0 and self.colliders.covers(i, x):
-                phi, normal = self.colliders.distance(i, arm, 0)
-                if phi <= REACH * self.colliders.spacing:
-                    after, grip = self.colliders.met(i, arm, normal, v)
-                    if grip != LOOSE:
-                        row = (
-                            self.run * self.colliders.loads.rows + self.colliders.loads.row_of(node)
-                        ) * self.count + j
-                        load = self.colliders.loads.of(mass * (v - after), arm)
-                        for a in ti.static(range(self.loads)):
-                            self.sums[row, a] = self.sums[row, a] + ti.cast(load[a], ti.f64)
-                        directions = 1
-                        if grip == HELD:
-                            directions += ti.static(d - 1)
-                        for c in range(directions):
-                            along = normal
-                            if grip == HELD:
-                                for a in ti.static(range(d)):
-                                    along[a] = ti.cast(a == c, float)
-                            self.resist(row, ti.cast(self.colliders.loads.of(along, arm), ti.f64), mass)
 
     @ti.func
     def resist(self, row: int, lever: ti.template(), mass: float):

@@ -12,7 +12,7 @@ import numpy as np
 
 from mpmcli.check.facts import BodyFacts, SceneFacts
 from mpmcli.check.finding import Finding
-from mpmcli.check.geometry import close_pairs
+from mpmcli.check.geometry import close_pairs, thickness
 from mpmcli.check.result_state import STRETCHED, TORN
 from mpmcli.scene import Scene
 from mpmcli.scene.bounds import body_points
@@ -22,6 +22,7 @@ from mpmcli.scene.primitives import grid_points
 from mpmcli.scene.problem import quoted, several
 from mpmcli.scene.quantity import AXES
 from mpmcli.scene.sampling import initial_deformation, initial_motion, moves_unevenly
+from mpmcli.scene.shapes import Mesh
 from mpmcli.scene.surface import form_surface, surface_points
 
 # Cells across a body below which internal motion is not resolved, and a rigid body is permeable. The stencil is three
@@ -49,8 +50,9 @@ BEGINS_INSIDE = 0.1
 UNDER = 1.0
 # Stretch beside a grip over that of the body between two grips, as measured for a bar pulled to twice its length.
 UNEVEN = 1.11
-# Cells that liquids and grains stand off colliders where they arrive, and across an opening that sand passes freely.
-STANDOFF, OPENING = (0.6, 1.5), 15.0
+# Cells within which liquids and grains come to rest on colliders where they arrive, and that they stand off those that
+# are thinner than a cell; cells across an opening that sand passes freely.
+NEAR, STANDOFF, OPENING = 0.2, (0.6, 1.5), 10.0
 # Points along the longest axis of the lattice that measures room, and number of instants of the run.
 POINTS, INSTANTS = {2: 96, 3: 32}, 33
 
@@ -345,16 +347,21 @@ def _rigid(facts: SceneFacts) -> Iterator[Finding]:
 
 
 def _standoff(facts: SceneFacts) -> Iterator[Finding]:
-    """Yield how far liquids and grains stand off colliders, and openings between colliders that hinder grains."""
+    """Yield how near liquids and grains come to colliders, and openings between colliders that hinder grains."""
     scene, h = facts.scene, facts.scene.domain.spacing
     solid = [one for one in scene.colliders if not one.holds]
     loose = [one.name for one in scene.sources if not one.has_surface]
     if not (solid and loose):
         return
-    low, high = (cells * h for cells in STANDOFF)
-    what = f"Material that arrives at a collider or a rigid body stands {low:.2g} to {high:.2g} m off its surface."
-    fix = f"Move surfaces whose place matters by {(low + high) / 2:.2g} m, or refine the domain."
-    yield Finding("note", "stand-off", what, fix, high, loose[0])
+    what = f"Material that arrives at a collider or a rigid body comes to rest within {NEAR * h:.2g} m of its surface."
+    fix, off = "Refine the domain if that matters.", NEAR * h
+    solids = [one for one in solid if not (one.free or one.side == "inside" or isinstance(one.form, Plane | Mesh))]
+    thin = [one.name for one in solids if thickness(one.form) < h]
+    if thin:
+        low, off = (cells * h for cells in STANDOFF)
+        what += f" It stands {low:.2g} to {off:.2g} m off {several(quoted(thin))}, thinner than a cell."
+        fix = f"Make colliders at least {h:.2g} m thick, or refine the domain."
+    yield Finding("note", "stand-off", what, fix, off, loose[0])
     grains = [one.name for one in scene.sources if one.material.law == "sand"]
     still = [one for one in solid if not (one.free or one.motion.moves or isinstance(one.form, Plane))]
     pairs = close_pairs(scene, [one.form for one in still], OPENING * h) if grains and len(still) > 1 else ()

@@ -69,6 +69,11 @@ class Layers:
         return result
 
 
+def touched(scene: Scene, layers: Layers) -> bool:
+    """Return whether colliders act at points of their surfaces: some do not hold, and bodies share a layer."""
+    return layers.shares and any(collider.wall != "hold" for collider in scene.colliders)
+
+
 def require_contact_possible(scene: Scene, backend: Backend) -> None:
     """Raise an error if bodies of a scene separate and its grid or backend supports only one velocity field.
 

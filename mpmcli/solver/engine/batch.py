@@ -18,6 +18,7 @@ from mpmcli.boundaries.walls import MovingFaces, RoughFaces, Walls, faces_on_gri
 from mpmcli.errors import InputError, RunError
 from mpmcli.quick_taichi import ti
 from mpmcli.solver.contact.body_contact import EXTREMES, BodyContact
+from mpmcli.solver.contact.collider_points import ColliderPoints
 from mpmcli.solver.contact.total_solids import DRIFT, contact_between, slips_in
 from mpmcli.solver.drive.forces import DriveValues, Gravity, HostValues, RigidDrive, push_on
 from mpmcli.solver.engine.compiled_kind import CompiledKind
@@ -133,13 +134,16 @@ class Batch:
         self._buffers = SortBuffers(groups, runs) if sorts else None
         orders = self._make_orders(groups, grid) if sorts else []
         contact = contact_between(groups, kind.bodies, grid, backend, runs)
-        colliders = motion = rigid = surfaces = None
+        colliders = motion = rigid = surfaces = points = None
         if kind.layers.separate:
             surfaces = BodyContact(groups, orders, grid, kind.layers, runs, backend.threads, on_cpu=on_cpu)
         if kind.colliders.count:
             how = {"on_cpu": on_cpu, "at_rest": kind.settings.solids == "total", "deterministic": deterministic}
             colliders = Colliders(kind.colliders, d, grid.shape, PAD, runs, **how)
             colliders.layered, colliders.own = kind.layers.separate, int(not kind.layers.shares)
+            if kind.by_points:
+                colliders.support = scheme.spline.nodes / 2
+                points = ColliderPoints(colliders, grid.node_count, grid.layers, runs)
             motion = ColliderMotion(colliders, runs) if kind.colliders.moving else None
             if kind.colliders.free:
                 rigid = RigidBodies(colliders, RigidDrive(d, kind.drives, self.values.device), runs)
@@ -153,7 +157,7 @@ class Batch:
             walls,
             friction,
             moving,
-            NodeUpdate(grid, images, colliders, rigid),
+            NodeUpdate(grid, images, colliders, rigid, points),
             ParticleUpdate(
                 grid, kind.faces, runs * len(groups), contact, friction, moving, watches_box=sorts and not on_cpu
             ),
@@ -165,6 +169,7 @@ class Batch:
             RigidContact(rigid, kind.faces, runs) if rigid else None,
             Emission(kind.inflow, d, runs) if kind.inflow.groups else None,
             surfaces,
+            points,
             ti.field(int, shape=(2 * runs, d)) if on_cpu else None,
             sorts,
             self._drift_allowed(grid, contact is not None),
@@ -255,8 +260,10 @@ class Batch:
         grid = self._make_grid(device.grid.period, min(GROWTH * blocks, most))
         nodes, particles = copy(device.nodes), copy(device.particles)
         nodes.grid = particles.grid = particles.near = grid
+        if nodes.points is not None:
+            nodes.points = nodes.points.on(grid.node_count)
         orders = self._make_orders(device.groups, grid)
-        self.device = replace(device, grid=grid, orders=orders, nodes=nodes, particles=particles)
+        self.device = replace(device, grid=grid, orders=orders, nodes=nodes, particles=particles, points=nodes.points)
         self._build_cpu()
 
     def _build_cpu(self) -> None:

@@ -62,6 +62,11 @@ class CompiledKind:
     layers: Layers
     members: tuple[Law, ...] = field(compare=False, repr=False)
 
+    @property
+    def by_points(self) -> bool:
+        """Whether colliders act at points of their surfaces on the bodies that share a layer."""
+        return self.colliders.touched and self.layers.shares
+
     @staticmethod
     def of(scene: Scene, particles: Sequence[BodyParticles]) -> "CompiledKind":
         """Return the kind of a scene with these particles, one entry per source."""
@@ -80,7 +85,7 @@ class CompiledKind:
             # Rigid bodies alone have none, but fields have an entry.
             tuple(max(1, sum(len(particles[i].position) for i in own)) for own in places),
             tuple(max(1, len(own)) for own in places),
-            needs_filling(scene, members, Layers.of(scene).count),
+            needs_filling(scene, members, Layers.of(scene)),
             fine_nodes(scene, members),
             keeps_motion(scene, members),
             wants_sparse(scene),

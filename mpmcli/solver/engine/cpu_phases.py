@@ -59,6 +59,7 @@ class PartKind(NamedTuple):
         first, after: number of the first phase, and of the one after the last.
         body: name of the method.
         item: function for each node or particle, for methods that only loop.
+        wanted: function that tells whether a row of nodes has work, see `Phase`.
     """
 
     name: str
@@ -67,6 +68,7 @@ class PartKind(NamedTuple):
     after: int
     body: str
     item: Callable | None
+    wanted: Callable | None = None
 
 
 class Part(Work):
@@ -85,6 +87,7 @@ class Part(Work):
         """Store a view and variables of a kernel."""
         super().__init__(view, kind.group, kind.item, turn)
         self.region, self.part, self.t, self.frame_buffer = variables
+        self.wanted = kind.wanted
 
 
 @ti.data_oriented
@@ -263,10 +266,10 @@ class CpuPhases(RunPhases):
     def _add(self, name: str, group: int, first: int, length: int, phase: Phase | None = None) -> int:
         """Number phases, and return the number after the last."""
         item, body = phase and (phase.ranged or phase.body), name
-        if item:
+        if item and phase.over != "rows":
             body = "each_node" if phase.over == "nodes" else "each_in_pencils" if phase.adds else "each_particle"
             body = "shift_nodes" if body == "each_node" and phase.shifts else body
-        self.kinds += (PartKind(name, group, first, first + length, body, item),)
+        self.kinds += (PartKind(name, group, first, first + length, body, item, phase and phase.wanted),)
         return first + length
 
     def body(self, kind: PartKind) -> object:
@@ -357,10 +360,15 @@ class CpuPhases(RunPhases):
         else:
             first, after = self.places.rows_of(at.grid, at.region)
             first, after = self.share(first, after, at.part)
-            for layer in range(self.layer_count(at)):
-                own = self.used_by(at, layer)
-                (inner,) = ti.static((at.in_layer(layer, own),))
+            if ti.static(at.wanted):
+                own = self.used_by(at, 0)
+                (inner,) = ti.static((at.in_layer(0, own),))
                 nodes_of_rows(inner, first, after, inner.step.kick)
+            else:
+                for layer in range(self.layer_count(at)):
+                    own = self.used_by(at, layer)
+                    (inner,) = ti.static((at.in_layer(layer, own),))
+                    nodes_of_rows(inner, first, after, inner.step.kick)
 
     @ti.func
     def shift_nodes(self, at: ti.template()):
@@ -501,32 +509,27 @@ class CpuPhases(RunPhases):
     @ti.func
     def update(self, at: ti.template()):
         """Convert the momentum of nodes to velocity."""
-        ti.atomic_max(at.step.speed_squared, self.updated(at, False))
-
-    @ti.func
-    def updated(self, at: ti.template(), meets: ti.template()):
-        """Update nodes, or if `meets` sum their exchange with rigid bodies; return the largest squared speed."""
         speed_squared = 0.0
         if ti.static(at.grid.sparse):
             # Whole pencils, because the loads on colliders are summed row by row.
             first, after = self.places.even_part(at.grid.sizes[PENCILS], at.region)
             first, after = self.share(first, after, at.part)
             begin, end = at.grid.pencils[first], at.grid.pencils[after]
-            speed_squared = update_blocks(at, begin, end, self.gravity_of(at.step), meets)
+            speed_squared = update_blocks(at, begin, end, self.gravity_of(at.step))
         else:
             first, after = self.places.rows_of(at.grid, at.region)
             first, after = self.share(first, after, at.part)
             for layer in range(self.layer_count(at)):
                 own = self.used_by(at, layer)
                 (inner,) = ti.static((at.in_layer(layer, own),))
-                speed_squared = ti.max(speed_squared, update_rows(inner, first, after, self.gravity_of(at.step), meets))
-        return speed_squared
+                speed_squared = ti.max(speed_squared, update_rows(inner, first, after, self.gravity_of(at.step)))
+        ti.atomic_max(at.step.speed_squared, speed_squared)
 
     @ti.func
     def meet(self, at: ti.template()):
-        """Find the velocities of rigid bodies: sum the contributions of nodes in even turns, and solve in odd turns."""
+        """Find the velocities of rigid bodies: sum the impulses of points in even turns, and solve in odd turns."""
         if at.turn % 2 == 0:
-            self.updated(at, True)
+            self.each_node(at)
         elif at.region == 0 and at.part == 0:
             at.nodes.rigid.solve(at.w, at.run.dt)
 

@@ -12,6 +12,7 @@ from mpmcli.boundaries.rigid_contact import RigidContact
 from mpmcli.boundaries.walls import MovingFaces, RoughFaces, Walls
 from mpmcli.quick_taichi import ti
 from mpmcli.solver.contact.body_contact import BodyContact
+from mpmcli.solver.contact.collider_points import ColliderPoints
 from mpmcli.solver.contact.surfaces import Obstacles
 from mpmcli.solver.drive.forces import DriveValues, Gravity
 from mpmcli.solver.engine.run_state import Layout, RunState, StepState
@@ -45,6 +46,7 @@ class Device:
         values, gravity: numbers for expressions, and varying gravity.
         emission: mouths of emitters; None if there are none.
         contact: contact of bodies with their own layers of nodes; None if all share one layer.
+        points: contact with colliders at points of their surfaces; None if there is none.
         stencils: (2 runs, d) int, per run the smallest and largest first node of a stencil per axis at the last sort;
             None on a GPU.
         sorts: whether particles are sorted; several small runs on a GPU instead use all nodes of their domains.
@@ -70,6 +72,7 @@ class Device:
     rigid_contact: RigidContact | None = None
     emission: Emission | None = None
     contact: BodyContact | None = None
+    points: ColliderPoints | None = None
     stencils: ti.Field | None = None
     sorts: bool = True
     drift_allowed: float = 1.0
@@ -93,6 +96,7 @@ class Device:
             separates=self.contact is not None,
             serial=self.stencils is not None,
             rigid=self.rigid is not None,
+            points=self.points is not None,
         )
 
 
@@ -110,6 +114,7 @@ class RunView:
         run, step: numbers of the run and of its step.
         w: index of the run.
         grid, nodes, particles: grid of the run, and updates of its nodes and particles.
+        points: contact at points of the surfaces of colliders, or None.
         orders, groups: tile order and particles of each law.
     """
 
@@ -155,12 +160,15 @@ class RunView:
         walls.first_plane = w * (device.grid.layers * len(walls.separating))
         walls.first_rough = w * (device.grid.layers * len(walls.rough))
         images = _changed(device.nodes.images, walls=walls)
-        colliders, rigid = device.colliders, device.rigid
+        colliders, rigid, points = device.colliders, device.rigid, device.points
         if colliders is not None:
             colliders = _changed(colliders, run=w, spacing=h)
         if rigid is not None:
             rigid = _changed(rigid, run=w, colliders=colliders)
-        self.nodes = _changed(device.nodes, grid=self.grid, images=images, colliders=colliders, rigid=rigid)
+        if points is not None:
+            points = points.seen_from(w, colliders)
+        shared = {"colliders": colliders, "rigid": rigid, "points": points}
+        self.nodes, self.points = _changed(device.nodes, grid=self.grid, images=images, **shared), points
         self.particles = _changed(
             device.particles,
             grid=self.grid,
@@ -184,7 +192,7 @@ class Work:
     """The work of a thread in a phase, with the view of its run.
 
     Attributes:
-        run, step, grid, nodes, particles: see `RunView`.
+        run, step, grid, nodes, particles, points: see `RunView`.
         order, group: tile order and fields of the group of particles.
         item: function for each node or particle.
         g: index of the group.
@@ -194,7 +202,7 @@ class Work:
 
     def __init__(self, view: RunView, g: int, item: Callable | None, turn: object) -> None:
         self.run, self.step, self.w = view.run, view.step, view.w
-        self.grid, self.nodes, self.particles = view.grid, view.nodes, view.particles
+        self.grid, self.nodes, self.particles, self.points = view.grid, view.nodes, view.particles, view.points
         self.g, self.group, self.order = g, view.groups[g], view.orders[g] if view.orders else None
         self.item, self.turn = item, turn
 

@@ -36,7 +36,7 @@ from mpmcli.solver.particles.state_bounds import (
     widen_motion,
     widen_state,
 )
-from mpmcli.solver.transfer.cpu_transfers import update_rows
+from mpmcli.solver.transfer.cpu_transfers import nodes_of_rows
 from mpmcli.solver.transfer.lanes import LANES
 from mpmcli.solver.transfer.particle_update import NOT_LOST, ParticleUpdate
 from mpmcli.solver.transfer.splines import PAD
@@ -49,14 +49,15 @@ class Item(Work):
 
     Attributes:
         atomic: whether sums need atomics; True.
+        peaks: extremes of the step, see `GpuPhases`.
     """
 
-    atomic = True
+    atomic, wanted = True, None
 
-    def __init__(self, view: RunView, phase: Phase, turn: int, q: object) -> None:
+    def __init__(self, view: RunView, phase: Phase, turn: int, q: object, peaks: Maxima) -> None:
         """Store a view and a variable of a kernel."""
         super().__init__(view, phase.group, phase.body, turn)
-        self.q = q
+        self.q, self.peaks = q, peaks
 
 
 @ti.data_oriented
@@ -99,14 +100,14 @@ class GpuPhases(RunPhases):
         """Process one item of a run in one turn of a phase."""
         (run,) = ti.static((self.run(w),))
         (view,) = ti.static(self.see(run))
-        (at,) = ti.static((Item(view, phase, turn, q),))
+        (at,) = ti.static((Item(view, phase, turn, q, self.peaks),))
         ti.static(self.body(phase))(at)
 
     def body(self, phase: Phase) -> object:
         """Return the method of a phase."""
         if phase.shifts:
             return self.shift_node if phase.over == "nodes" else self.shift_particle
-        if phase.body:
+        if phase.body and phase.over == "nodes":
             return self.each_node
         return getattr(self, phase.name)
 
@@ -222,10 +223,10 @@ class GpuPhases(RunPhases):
 
     @ti.func
     def meet(self, at: ti.template()):
-        """Find the velocities of rigid bodies: sum the contributions of nodes in even turns, and solve in odd turns."""
+        """Find the velocities of rigid bodies: sum the impulses of points in even turns, and solve in odd turns."""
         if ti.static(at.turn % 2 == 0):
             if at.q < at.grid.row_count():
-                _speed = update_rows(at, at.q, at.q + 1, self.gravity_of(at.step), True)
+                nodes_of_rows(at, at.q, at.q + 1, at.step.kick)
         elif at.q == 0:
             at.nodes.rigid.solve(at.w, at.run.dt)
 
@@ -238,6 +239,8 @@ class GpuPhases(RunPhases):
     def add_loads(self, at: ti.template()):
         """Sum the loads of the nodes of a row on a collider, in order."""
         at.nodes.colliders.add_row(at.q)
+        if ti.static(at.nodes.touches):
+            at.points.add_row(at.grid, at.q)
 
     @ti.func
     def advance(self, at: ti.template()):

@@ -134,7 +134,7 @@ class Run:
         """Write the constants of a run: domain, walls, colliders, emitters and bounds on the step."""
         scene, device, state = self.scene, self.batch.device, self._state
         walls, colliders = (device.friction, device.moving, device.grid.period), (device.colliders, device.motion)
-        for data in (*walls, *colliders, device.rigid, device.rigid_contact, device.contact):
+        for data in (*walls, *colliders, device.rigid, device.rigid_contact, device.contact, device.points):
             if data is not None:
                 data.write(scene, self.slot)
         h = scene.domain.spacing

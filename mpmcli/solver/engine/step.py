@@ -22,6 +22,7 @@ from typing import Literal
 from mpmcli.boundaries.rigid_bodies import ROUNDS
 from mpmcli.materials.law import Law
 from mpmcli.quick_taichi import ti
+from mpmcli.solver.contact import collider_points as touch
 from mpmcli.solver.transfer import redistribution as by
 
 
@@ -42,6 +43,8 @@ class Phase:
         body: function of one node or particle on any device, for phases without a method: body(at, node, kick), or in a
             shift body(at, node or particle, time over which volumes relax).
         ranged: the same for a range of particles on the CPU.
+        wanted: function of the first node of a row on a dense grid on the CPU, which returns whether the row has work:
+            wanted(at, node). Such phases have work in layer 0 alone.
         shifts: whether the phase belongs to the shift of particles.
     """
 
@@ -52,6 +55,7 @@ class Phase:
     turns: int = 1
     body: Callable | None = None
     ranged: Callable | None = None
+    wanted: Callable | None = None
     shifts: bool = False
 
 
@@ -67,10 +71,11 @@ def step_phases(
     separates: bool = False,
     serial: bool = True,
     rigid: bool = False,
+    points: bool = False,
 ) -> tuple[Phase, ...]:
     """Return the phases of a step; consecutive ones with the same name that do not add to nodes may run concurrently.
 
-    The phase "meet" takes two turns per round: over nodes, and over rigid bodies.
+    The phase "meet" takes two turns per round: over points, and over rigid bodies.
 
     Args:
         laws: the laws, one per group.
@@ -83,6 +88,7 @@ def step_phases(
         separates: whether bodies have velocity fields of their own, with contact at their surfaces.
         serial: whether one thread lists surface particles, as on a CPU.
         rigid: whether any collider moves freely.
+        points: whether colliders act at points of their surfaces.
     """
     groups = range(len(laws))
     return (
@@ -91,6 +97,8 @@ def step_phases(
         *(Phase("average", "particles", g, adds=True) for g in groups if uses_f_bar[g]),
         *(Phase("scatter", "particles", g, adds=True) for g in groups),
         *[Phase("to_float", "nodes")] * deterministic,
+        *[Phase("fill_solids", "nodes", body=touch.fill_solids, wanted=touch.near_row)]
+        * (points and any(law.relaxes for law in laws)),
         *(Phase("relax", "particles", g) for g in groups if laws[g].relaxes),
         *[Phase("find_bodies", "nodes")] * separates,
         *(Phase("show_surface", "particles", g) for g in groups if separates and laws[g].surfaced),
@@ -101,8 +109,13 @@ def step_phases(
         *[Phase("exchange", "threads")] * separates,
         *[Phase("find_contact", "planes")] * contact,
         *[Phase("find_friction", "planes")] * friction,
-        *[Phase("meet", "rows", turns=2 * ROUNDS)] * rigid,
         Phase("update", "nodes"),
+        *[Phase("find_points", "nodes", body=touch.find_points, wanted=touch.new_row)] * points,
+        *[Phase("spread_points", "nodes", body=touch.spread_points, wanted=touch.marked_row)] * points,
+        *[Phase("weigh_points", "nodes", body=touch.weigh_points, wanted=touch.busy_row)] * points,
+        *[Phase("meet", "rows", turns=2 * ROUNDS, body=touch.meet_points, wanted=touch.busy_row)] * rigid,
+        *[Phase("settle_points", "nodes", body=touch.settle_points, wanted=touch.busy_row)] * rigid,
+        *[Phase("push_points", "nodes", body=touch.push_points, wanted=touch.last_row)] * points,
         *[Phase("add_loads", "loads")] * loads,
         *[Phase("move_bodies", "bodies")] * rigid,
         *(Phase("advance", "particles", g) for g in groups),

@@ -264,6 +264,17 @@ class Grid(LinearNodes):
         return length
 
     @ti.func
+    def in_use(self, node: ti.template()):
+        """Return whether a node is in the box in use."""
+        inside = True
+        for a in ti.static(range(self.dimension)):
+            if ti.static(self.narrow):
+                inside = inside and node[a] >= self.own[0, a] and node[a] < self.own[0, a] + self.own[1, a]
+            else:
+                inside = inside and node[a] >= self.box[0, a] and node[a] < self.box[0, a] + self.box[1, a]
+        return inside
+
+    @ti.func
     def box_nodes(self):
         return self.row_count() * self.box[1, ti.static(self.dimension - 1)]
 

@@ -28,7 +28,8 @@ from mpmcli.scene import Scene
 from mpmcli.scene.sampling import count_body, estimate_body, has_expressions
 from mpmcli.scene.sheets import sheets_of
 from mpmcli.solver.contact.body_contact import BodyContact
-from mpmcli.solver.contact.layers import Layers, require_contact_possible
+from mpmcli.solver.contact.collider_points import ColliderPoints
+from mpmcli.solver.contact.layers import Layers, require_contact_possible, touched
 from mpmcli.solver.contact.surfaces import BodySurfaces
 from mpmcli.solver.contact.total_solids import ParticleContact, bins_along, slips_in
 from mpmcli.solver.drive.forces import forces_on, names_of, needs_initial
@@ -187,6 +188,9 @@ WORDS = {
     "exchange": "let bodies push each other",
     "find_contact": "find contact",
     "find_friction": "find friction",
+    "find_points": "find points of colliders",
+    "weigh_points": "find impulses of colliders",
+    "push_points": "let colliders push",
     "meet": "meet rigid bodies",
     "move_bodies": "move rigid bodies",
     "add_loads": "add up loads",
@@ -281,6 +285,7 @@ def passes_of(members: Sequence[Law], scene: Scene, *, deterministic: bool = Fal
         loads=deterministic and bool(scene.colliders),
         separates=layers.separate,
         rigid=any(collider.free for collider in scene.colliders),
+        points=touched(scene, layers),
     )
     forces = [" with forces" * bool(forces_on(scene, names_of(scene, members_of(scene, law.name)))) for law in members]
     words = WORDS | {"update": "update grid" + " with colliders" * bool(scene.colliders)}
@@ -350,7 +355,7 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
     if sparse:
         blocks = room_for_blocks(sum(map(in_steps, counts.values())))
         nodes = blocks * tile**dimension
-    filling, deterministic = needs_filling(scene, members, layers), scene.solver.deterministic and not backend.on_cpu
+    filling, deterministic = needs_filling(scene, members, fields_of), scene.solver.deterministic and not backend.on_cpu
     numbers = layers * width * (1 + scheme.keeps_flip_velocity + filling)
     node_bytes = real * (numbers + layers * 4 * sum(averaged))
     # 0 without shifts.
@@ -379,6 +384,8 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
     tables += Loads.bytes_needed(max(1, pairs), dimension, rows) if separate else 0
     at_rest = scene.solver.solids == "total"
     tables += padded_colliders(ColliderKind.of(scene)).bytes_needed(dimension, rows, real, at_rest=at_rest)
+    met = touched(scene, fields_of)
+    tables += ColliderPoints.bytes_needed(nodes, rows, dimension, real) if met else 0
     if deterministic:
         tables += nodes * padded_colliders(ColliderKind.of(scene)).count * dimension * real
     host_bytes = host_bytes_of(scene, members, sum(counts.values()), real, on_cpu=backend.on_cpu)
@@ -387,7 +394,8 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
     shown = sum(map(in_steps, counts.values())) * frame_columns(scene, members)
     sorted_entries = max(map(in_steps, counts.values())) * max(len(groups), widest // real)
     counted = (blocks if sparse else all_tiles) * backend.threads
-    entries = max(nodes * max(fine, layers), all_tiles, bins, shown, sorted_entries, counted)
+    weights = ColliderPoints.room(nodes, dimension) * 3**dimension if met else 0
+    entries = max(nodes * max(fine, layers), weights, all_tiles, bins, shown, sorted_entries, counted)
     return Plan(groups, nodes, widest + 8, node_bytes, grid_bytes, host_bytes, passes, backend.arch, sparse, entries)
 
 

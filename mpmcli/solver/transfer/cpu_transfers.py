@@ -385,20 +385,15 @@ def advance_tiles(at: ti.template(), first: int, after: int, dt: float, gravity_
 
 
 @ti.func
-def update_rows(at: ti.template(), first: int, last: int, gravity_step: ti.template(), meets: ti.template()):
-    """Update the nodes in rows first to last - 1 of the box in use; return the largest squared speed.
-
-    For `meets` see `NodeUpdate.update`.
-    """
+def update_rows(at: ti.template(), first: int, last: int, gravity_step: ti.template()):
+    """Update the nodes in rows first to last - 1 of the box in use; return the largest squared speed."""
     d = ti.static(at.grid.dimension)
     speed_squared = 0.0
     for row in range(first, last):
         node = at.grid.row_start(row)
         index, nodes = at.grid.linear_index(node), at.grid.row_length(node)
-        if ti.static(meets):
-            nodes *= at.nodes.rigid.near(node, d - 1)
         for k in range(nodes):
-            squared = at.nodes.update(node, index + k, gravity_step, meets)
+            squared = at.nodes.update(node, index + k, gravity_step)
             # Not `ti.max`: its handling of NaN takes twice as long, at every node without mass.
             if squared > speed_squared:
                 speed_squared = squared
@@ -411,7 +406,11 @@ def nodes_of_rows(at: ti.template(), first: int, last: int, kick: float):
     """Apply the function of a phase to each node in rows first to last - 1 of the box in use."""
     for row in range(first, last):
         node = at.grid.row_start(row)
-        for _ in range(at.grid.row_length(node)):
+        count = at.grid.row_length(node)
+        if ti.static(at.wanted):
+            if not ti.static(at.wanted)(at, node):
+                count = 0
+        for _ in range(count):
             ti.static(at.item)(at, node, kick)
             node[ti.static(at.grid.dimension - 1)] += 1
 
@@ -431,7 +430,7 @@ def nodes_of_blocks(at: ti.template(), first: int, after: int, kick: float):
 
 
 @ti.func
-def update_blocks(at: ti.template(), first: int, after: int, gravity_step: ti.template(), meets: ti.template()):
+def update_blocks(at: ti.template(), first: int, after: int, gravity_step: ti.template()):
     """Update the nodes of blocks `first` to `after` - 1 in the box; return the largest squared speed."""
     grid, d = ti.static((at.grid, at.grid.dimension))
     speed_squared = 0.0
@@ -444,7 +443,7 @@ def update_blocks(at: ti.template(), first: int, after: int, gravity_step: ti.te
                 node[a] = place[a] * ti.static(grid.tile) + along
                 inside = inside and node[a] >= grid.box[0, a] and node[a] < grid.box[0, a] + grid.box[1, a]
             if inside:
-                squared = at.nodes.update(node, b * ti.static(grid.block) + q, gravity_step, meets)
+                squared = at.nodes.update(node, b * ti.static(grid.block) + q, gravity_step)
                 # Not `ti.max`, see `update_rows`.
                 if squared > speed_squared:
                     speed_squared = squared

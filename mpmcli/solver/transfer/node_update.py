@@ -7,6 +7,7 @@ from mpmcli.boundaries.mirror_images import MirrorImages
 from mpmcli.boundaries.rigid_bodies import RigidBodies
 from mpmcli.boundaries.walls import REACH
 from mpmcli.quick_taichi import ti
+from mpmcli.solver.contact.collider_points import ColliderPoints
 from mpmcli.solver.grid.grid import Grid
 
 
@@ -18,15 +19,22 @@ class NodeUpdate:
         images: mirror images beyond walls, which constrain the velocity.
         colliders: colliders, which constrain it after the walls; None if there are none.
         rigid: freely moving rigid bodies; None if there are none.
+        points: contact at points of the surfaces of colliders, in layer 0; None if there is none.
     """
 
     def __init__(
-        self, grid: Grid, images: MirrorImages, colliders: Colliders | None = None, rigid: RigidBodies | None = None
+        self,
+        grid: Grid,
+        images: MirrorImages,
+        colliders: Colliders | None = None,
+        rigid: RigidBodies | None = None,
+        points: ColliderPoints | None = None,
     ) -> None:
         self.grid, self.dimension, self.images = grid, grid.dimension, images
         self.needs_contact, self.needs_friction = images.needs_contact, images.needs_friction
         self.collides, self.colliders = colliders is not None, colliders
-        self.rigid = rigid
+        self.rigid, self.couples = rigid, rigid is not None
+        self.touches, self.points = points is not None, points
 
     def in_layer(self, grid: Grid, layer: object) -> "NodeUpdate":
         """Return the update of a layer of nodes, given its number, a variable of a kernel."""
@@ -38,10 +46,8 @@ class NodeUpdate:
         return view
 
     @ti.func
-    def update(self, node: ti.template(), index: int, gravity_step: ti.template(), meets: ti.template() = False):
+    def update(self, node: ti.template(), index: int, gravity_step: ti.template()):
         """Update a node and its images; return its squared speed, 0 at an image and at a node without mass.
-
-        If `meets`, only the sums of rigid bodies change.
 
         Gravity, gravity_step (m/s), is added to the momentum of every image near a wall, and elsewhere to the velocity.
         """
@@ -52,14 +58,12 @@ class NodeUpdate:
         if ti.static(len(self.grid.period.axes) > 0):
             # This does not hold beyond a periodic face.
             massive = massive or self.images.walls.near(node)
-        if ti.static(meets):
-            massive = massive and self.rigid.near(node, self.dimension) == 1
         if massive:
-            speed_squared = self.update_massive(node, index, gravity_step, meets)
+            speed_squared = self.update_massive(node, index, gravity_step)
         return speed_squared
 
     @ti.func
-    def update_massive(self, node: ti.template(), index: int, gravity_step: ti.template(), meets: ti.template()):
+    def update_massive(self, node: ti.template(), index: int, gravity_step: ti.template()):
         d = ti.static(self.dimension)
         value = self.grid.part(index, 0)
         pull = gravity_step
@@ -98,18 +102,21 @@ class NodeUpdate:
                 constrained = self.images.walls.constrained(velocity, depth, upper, acts, holds)
                 for c in ti.static(range(d)):
                     velocity[c] = constrained[c]
-            if ti.static(meets):
-                self.rigid.meet(node, velocity, value[d])
-            else:
-                if ti.static(self.collides):
-                    met = self.colliders.constrain(node, velocity, value[d])
-                    for c in ti.static(range(d)):
-                        velocity[c] = met[c]
+            outside = 1.0
+            if ti.static(self.collides):
+                met, outside = self.colliders.constrain(node, velocity, value[d], self.grid.scheme.spline)
+                for c in ti.static(range(d)):
+                    velocity[c] = met[c]
+                if ti.static(self.touches):
+                    if self.colliders.own == 0:
+                        self.points.free[self.points.place(index)] = outside
 
-                # Unfold.
-                self.write(0, node, index, kind, place, velocity)
-                if ti.static(self.grid.scheme.keeps_flip_velocity):
-                    self.update_before(node, index, kind, place)
+            # Unfold.
+            self.write(0, node, index, kind, place, velocity)
+            if ti.static(self.grid.scheme.keeps_flip_velocity):
+                self.update_before(node, index, kind, place)
+            # Nodes inside a surface have yet to follow its points, and hardly move particles.
+            if ti.abs(outside) > 0.5:
                 for a in ti.static(range(d)):
                     speed_squared += velocity[a] ** 2
         return speed_squared

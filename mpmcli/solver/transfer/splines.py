@@ -55,6 +55,14 @@ class QuadraticSpline:
         beyond = ti.max(1.5 - far, 0.0)
         return ti.select(far < 0.5, 0.75 - far**2, 0.5 * beyond**2)
 
+    @ti.func
+    def share_below(self, r: float):
+        """Return the integral of the weight from minus infinity to r cells."""
+        far = ti.abs(r)
+        beyond = ti.max(1.5 - far, 0.0)
+        above = ti.select(far < 0.5, 0.5 - far * (0.75 - far**2 / 3.0), beyond**3 / 6.0)
+        return ti.select(r > 0.0, 1.0 - above, above)
+
 
 @ti.data_oriented
 class CubicSpline:
@@ -86,6 +94,15 @@ class CubicSpline:
         far = ti.abs(r)
         beyond = ti.max(2.0 - far, 0.0)
         return ti.select(far < 1.0, 2.0 / 3.0 - far**2 + 0.5 * far**3, beyond**3 / 6.0)
+
+    @ti.func
+    def share_below(self, r: float):
+        """Return the integral of the weight from minus infinity to r cells."""
+        far = ti.abs(r)
+        beyond = ti.max(2.0 - far, 0.0)
+        inner = 0.5 - far * (2.0 / 3.0 - far**2 / 3.0 + far**3 / 8.0)
+        above = ti.select(far < 1.0, inner, beyond**4 / 24.0)
+        return ti.select(r > 0.0, 1.0 - above, above)
 
 
 SPLINES = {"quadratic": QuadraticSpline(), "cubic": CubicSpline()}

@@ -19,6 +19,7 @@ from mpmcli.materials.tensors import volume_strain
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
 from mpmcli.scene.schema import SolverSettings
+from mpmcli.solver.contact.layers import Layers, touched
 from mpmcli.solver.particles.arrays import MASS, VOLUME
 from mpmcli.solver.particles.state_bounds import volume_ratio
 from mpmcli.solver.transfer.lanes import (
@@ -218,13 +219,13 @@ def average_for_frame(grid: ti.template(), g: ti.template(), group: ti.template(
         group.to_mean[p] = missing_to_mean(grid, g, group, p)
 
 
-def needs_filling(scene: Scene, laws: Sequence[Law], layers: int) -> bool:
+def needs_filling(scene: Scene, laws: Sequence[Law], layers: Layers) -> bool:
     """Return whether nodes store the volume scattered to them, in layer 0 for all layers.
 
-    With a single density and a single layer it follows from their mass.
+    With a single density, a single layer and no colliders that it touches, it follows from their mass.
     """
-    alike = len({body.material.density for body in scene.sources}) == 1 and layers == 1
-    return any(law.relaxes for law in laws) and not alike
+    alike = len({body.material.density for body in scene.sources}) == 1 and layers.count == 1
+    return any(law.relaxes for law in laws) and (touched(scene, layers) or not alike)
 
 
 @ti.func

@@ -1,0 +1,658 @@
+"""Contact of material with colliders at points of their surfaces (docs/theory.md, 3.8).
+
+A node within half a cell of a surface gives one point of it, the nearest. The velocity of the material at the point is
+interpolated from the 3^d nodes around this node, and the impulse that stops it is spread by the same weights. Both
+momenta are exact, and the surface acts where it is, at any position on the grid. Kinetic energy only falls, but for
+material that has drifted in, see `LIFT`.
+
+Nodes gather from points, and points from nodes, so that the results depend neither on threads nor on the order in which
+points are found. A step calls, with a barrier after each: `find`, `spread_out`, `weigh`, for rigid bodies `meet` and
+`settle`, and `push`.
+"""
+
+import math
+from copy import copy
+
+from mpmcli.boundaries.colliders import HELD, HOLD, LOOSE, PRESSED, SEPARATE, STICK, Colliders
+from mpmcli.materials.law import StateBound
+from mpmcli.materials.registry import laws
+from mpmcli.quick_taichi import ti
+from mpmcli.scene import Scene
+from mpmcli.solver.transfer.splines import QuadraticSpline
+
+# A point acts if the share of its kernel that is filled is FULL or more, not at all up to EMPTY. The share falls from 1
+# to 0.8, 0.54, 0.34 if material stands off by 0.1, 0.3, 0.5 cells, wherever the nodes are.
+EMPTY, FULL = 0.5, 0.8
+# Between these shares the weights of nodes that lack material rise from their filled part to the whole: the former lets
+# material come near, the latter makes less noise where it rests.
+PART, WHOLE = 0.75, 0.9
+# Smallest share of the kernel of a node outside of colliders by which masses are divided, and the smallest for which
+# the mass of a full node is estimated.
+LEAST, FREE = 1e-5, 0.45
+# Material that fills more than the outside of a surface has drifted in by the surplus over RISE cells: per cell, the
+# integral of the square of the spline. Beyond SLACK cells it moves out, at LIFT times the wave speed per cell. Full
+# nodes are those of which OUTER or more is outside.
+RISE, SLACK, LIFT, OUTER = 0.55, 0.2, 0.01, 0.8
+# Distance from a surface, cells, within which a node gives a point: a little more than a half, so that rounding leaves
+# out no surface between two nodes. The share of such a node is at most NEAR.
+HALF, NEAR = 0.501, 0.835
+# Share of the mass of a full node below which the speed of a node does not bound the step.
+LIGHT = 0.1
+
+
+@ti.func
+def smooth(t: float):
+    """Return a smooth step from 0 at t = 0 to 1 at t = 1."""
+    inside = ti.min(ti.max(t, 0.0), 1.0)
+    return inside * inside * (3.0 - 2.0 * inside)
+
+
+@ti.data_oriented
+class ColliderPoints:
+    """The points of the surfaces of colliders that material touches in a step, in the shared layer of some runs.
+
+    Attributes:
+        capacity: largest number of points of a run.
+        count: number of points of each run, while they are found.
+        density: mass of a full node, kg, of the lightest material of each run.
+        rate: velocity at which material that has drifted in moves out, per cell, m/s, of each run.
+        free: per node, the share of its kernel that is outside of colliders, negative if a collider holds the node.
+        head: per node, 1 + the index of its first point, or 0; `next` of a point likewise.
+        busy, marked: whether a row of nodes has points, and whether points have weights in it, 1 or 0; for phases that
+            go row by row.
+        spread: per node, the sum of the weights of all points; -1 while it is not yet summed.
+        collider: index of the collider in its run.
+        normal: normal into the material.
+        centre: weighted mean of the positions of the nodes relative to the lower corner, m, where impulses act.
+        weights: weights of the nodes around the node of the point; `share` is their sum.
+        part: share of the point that belongs to the domain: a half on a wall.
+        gain: impulse per velocity, kg.
+        lift: velocity at which material moves out of the collider, m/s.
+        given: velocity of the material times `share`, then the impulse per weight on the material, N s.
+    """
+
+    def __init__(self, colliders: Colliders, nodes: int, layers: int, runs: int) -> None:
+        """Allocate points for a grid with a number of nodes per run and layer."""
+        d = colliders.dimension
+        self.colliders, self.dimension, self.run, self.layers = colliders, d, 0, layers
+        self.node_count, self.capacity, self.stencil = nodes, self.room(nodes, d), 3**d
+        n = runs * self.capacity
+        self.count = ti.field(int, shape=runs)
+        self.density, self.rate = ti.field(float, shape=runs), ti.field(float, shape=runs)
+        self.free, self.spread = (ti.field(float, shape=runs * nodes) for _ in range(2))
+        self.head = ti.field(int, shape=runs * nodes)
+        self.next, self.collider = ti.field(int, shape=n), ti.field(int, shape=n)
+        self.normal, self.centre, self.given = (ti.Vector.field(d, float, shape=n) for _ in range(3))
+        self.part, self.share, self.gain, self.lift = (ti.field(float, shape=n) for _ in range(4))
+        self.weights = ti.field(float, shape=n * self.stencil)
+        self.rows = math.prod(colliders.shape[:-1])
+        self.busy, self.marked = ti.field(int, shape=runs * self.rows), ti.field(int, shape=runs * self.rows)
+        self.spline = QuadraticSpline()
+
+    @staticmethod
+    def room(nodes: int, dimension: int) -> int:
+        """Return the largest number of points of a run with this number of nodes."""
+        return nodes if dimension == 2 else min(nodes, nodes // 6 + 1000)
+
+    @staticmethod
+    def bytes_needed(nodes: int, rows: int, dimension: int, real: int) -> int:
+        """Return the bytes of all fields of a run."""
+        point = 8 + real * (3 * dimension + 4 + 3**dimension)
+        return 4 + 2 * real + 8 * rows + nodes * (4 + 2 * real) + ColliderPoints.room(nodes, dimension) * point
+
+    def on(self, nodes: int) -> "ColliderPoints":
+        """Return points for a grid with another number of nodes, and the same numbers of runs."""
+        result = ColliderPoints(self.colliders, nodes, self.layers, self.density.shape[0])
+        result.density, result.rate = self.density, self.rate
+        return result
+
+    def seen_from(self, run: object, colliders: Colliders) -> "ColliderPoints":
+        """Return the view of a run, given its number, a variable of a kernel, and its colliders."""
+        result = copy(self)
+        result.run, result.colliders = run, colliders
+        return result
+
+    def write(self, scene: Scene, run: int = 0) -> None:
+        """Set the mass of a full node of a run, and the rate."""
+        materials = [source.material for source in scene.sources]
+        members = [laws()[material.law]([material], scene.dimension) for material in materials]
+        modes = [law.modes(material, StateBound()) for law, material in zip(members, materials, strict=True)]
+        stiffness = [max(mode.stiffness for mode in each) for each in modes]
+        waves = [math.sqrt(found / each.density) for found, each in zip(stiffness, materials, strict=True)]
+        self.rate[run] = LIFT * max(waves, default=0.0)
+        least = min((body.material.density for body in scene.sources), default=0.0)
+        self.density[run] = least * scene.domain.spacing**self.dimension
+
+    # Shares of nodes.
+
+    @ti.func
+    def place(self, index: int):
+        """Return the index of a node of layer 0 in the fields of nodes, given that in the grid."""
+        return index - self.run * ti.static((self.layers - 1) * self.node_count)
+
+    @ti.func
+    def row_of(self, node: ti.template()):
+        """Return the index of the row of a node in the fields of rows."""
+        return self.run * self.rows + self.colliders.loads.row_of(node)
+
+    @ti.func
+    def near_row(self, node: ti.template()):
+        """Return whether a collider may cut the kernel of a node of the row that begins at a node."""
+        x, result = self.colliders.place_of(node), False
+        for k in range(self.colliders.count[self.run]):
+            i = self.run * self.colliders.capacity + k
+            result = result or self.colliders.covers(i, x, self.colliders.beyond(), self.dimension - 1)
+        return result
+
+    @ti.func
+    def fill(self, grid: ti.template(), walls: ti.template(), node: ti.template()):
+        """Count the part of a node that is inside of colliders as filled, for the relaxation of volumes."""
+        share, inside = 1.0 - ti.abs(self.colliders.free_share(node, grid.scheme.spline)), True
+        if share > 0.0:
+            for a in ti.static(range(self.dimension)):
+                if ti.static(a not in walls.periodic):
+                    inside = inside and node[a] >= walls.first and node[a] <= walls.last[a]
+                    if node[a] == walls.first or node[a] == walls.last[a]:
+                        share *= 0.5
+                share *= grid.spacing
+            if inside:
+                index = grid.linear_index(node)
+                entry = ti.static(self.dimension)
+                grid.filling[index][entry] = grid.filling[index][entry] + share
+
+    @ti.func
+    def owner(self, walls: ti.template(), node: ti.template()):
+        """Return the node inside the domain of which a node is the image, and 1 or -1 per component of its velocity."""
+        own, sign = node, ti.Vector.one(float, self.dimension)
+        if walls.near(node):
+            depth, mirror, upper = walls.place(node)
+            acts = walls.acting(node, depth, mirror, upper)
+            for a in ti.static(range(self.dimension)):
+                if acts[a] == 1 and depth[a] < 0:
+                    own[a] = mirror[a]
+                    self.reflect(walls, a, upper, sign)
+        return own, sign
+
+    @ti.func
+    def reflect(self, walls: ti.template(), a: ti.template(), upper: ti.template(), sign: ti.template()):
+        """Multiply the signs of a velocity by those of its mirror image at the wall of an axis."""
+        if ti.static(a not in walls.periodic):
+            for c in ti.static(range(self.dimension)):
+                if ti.static(c == a):
+                    sign[c] = -sign[c]
+                elif walls.face_is("stick", a, upper[a]):
+                    sign[c] = -sign[c]
+
+    @ti.func
+    def around(self, node: ti.template(), c: int, way: ti.template()):
+        """Return neighbour c of a node; with way = -1 the node of which this node is neighbour c."""
+        found, rest = node, c
+        for b in ti.static(range(self.dimension)):
+            a = ti.static(self.dimension - 1 - b)
+            found[a] += way * (rest % 3 - 1)
+            rest = rest // 3
+        return found
+
+    # Points.
+
+    @ti.func
+    def find(self, grid: ti.template(), walls: ti.template(), extent: ti.template(), node: ti.template()):
+        """Find the points of a node, and their weights."""
+        d = ti.static(self.dimension)
+        index = grid.linear_index(node)
+        own = self.place(index)
+        self.head[own] = 0
+        # Without mass at the node, no particle is within a cell of its point; images beyond a periodic face have none.
+        near = grid.nodes[index][d] > 0.0 and ti.abs(self.free[own]) <= NEAR
+        if ti.static(len(walls.periodic) > 0):
+            near = near or walls.near(node)
+        if near:
+            # Counted first: software Vulkan loses atomic additions in loops.
+            wanted = self.visit(walls, extent, node, own, -1)
+            if wanted > 0:
+                first = ti.atomic_add(self.count[self.run], wanted)
+                if first + wanted <= self.capacity:
+                    self.visit(walls, extent, node, own, self.run * self.capacity + first)
+            p, row = self.head[own] - 1, self.row_of(node)
+            while p >= 0:
+                self.busy[row] = 1
+                self.weight_all(grid, walls, node, p)
+                p = self.next[p] - 1
+
+    @ti.func
+    def visit(self, walls: ti.template(), extent: ti.template(), node: ti.template(), own: int, first: int):
+        """Return the number of points of a node; write them from index `first` on, unless it is negative."""
+        h, x, found = self.colliders.spacing, self.colliders.place_of(node), 0
+        for k in range(self.colliders.count[self.run]):
+            i = self.run * self.colliders.capacity + k
+            if self.colliders.wall[i] != HOLD and self.colliders.covers(i, x):
+                arm = x - self.colliders.place[i]
+                for face in range(self.colliders.faces_of(i)):
+                    phi, normal = self.colliders.distance(i, arm, face)
+                    if ti.abs(phi) <= HALF * h and self.colliders.acts_by_points(i, arm, face, phi, normal):
+                        y = x - phi * normal
+                        part = self.part_inside(walls, extent, y)
+                        if part > 0.0:
+                            if first >= 0:
+                                self.write_point(first + found, own, k, y, normal, part)
+                            found += 1
+        return found
+
+    @ti.func
+    def write_point(self, p: int, own: int, k: int, y: ti.template(), normal: ti.template(), part: float):
+        """Set point p, at y on collider k, of the node with this place in the fields of nodes."""
+        self.collider[p], self.part[p] = k, part
+        self.next[p], self.head[own] = self.head[own], p + 1
+        for a in ti.static(range(self.dimension)):
+            self.centre[p][a], self.normal[p][a] = y[a], normal[a]
+
+    @ti.func
+    def part_inside(self, walls: ti.template(), extent: ti.template(), y: ti.template()):
+        """Return the share of a point that belongs to the domain: 1, 0, or a half on a wall."""
+        part, tiny = 1.0, 1e-5 * self.colliders.spacing
+        for a in ti.static(range(self.dimension)):
+            if ti.static(a in walls.periodic):
+                if y[a] < -tiny or y[a] >= extent[a] - tiny:
+                    part = 0.0
+            else:
+                if y[a] < -tiny or y[a] > extent[a] + tiny:
+                    part = 0.0
+                elif y[a] < tiny or y[a] > extent[a] - tiny:
+                    part *= 0.5
+        return part
+
+    @ti.func
+    def weight(self, along: ti.template(), c: int):
+        """Return the weight of neighbour c from those along each axis, a row for each of the three nodes."""
+        result, rest = 1.0, c
+        for b in ti.static(range(self.dimension)):
+            a = ti.static(self.dimension - 1 - b)
+            k = rest % 3
+            result *= ti.select(k == 0, along[0, a], ti.select(k == 1, along[1, a], along[2, a]))
+            rest = rest // 3
+        return result
+
+    @ti.func
+    def weight_all(self, grid: ti.template(), walls: ti.template(), node: ti.template(), p: int):
+        """Find the weights of point p, which has its place in `centre`."""
+        d = ti.static(self.dimension)
+        i, h = self.run * self.colliders.capacity + self.collider[p], self.colliders.spacing
+        place = ti.Vector.zero(float, d)
+        for a in ti.static(range(d)):
+            place[a] = self.centre[p][a] / h - ti.cast(node[a] - self.colliders.first - 1, float)
+        along = self.spline.weights(place)
+        full, over = self.fill_stencil(grid, walls, node, along, p)
+        share, total, centre = 0.0, 0.0, ti.Vector.zero(float, d)
+        if full > 0.0:
+            for c in range(self.stencil):
+                share += self.weight(along, c) * ti.min(ti.abs(self.weights[p * self.stencil + c]) / full, 1.0)
+        acts = smooth((share - EMPTY) / (FULL - EMPTY))
+        whole = 0.0 if self.colliders.wall[i] == STICK else smooth((share - PART) / (WHOLE - PART))
+        for c in range(self.stencil):
+            weight = 0.0
+            if acts > 0.0 and self.weights[p * self.stencil + c] > 0.0:
+                filled = ti.min(self.weights[p * self.stencil + c] / full, 1.0)
+                weight = self.weight(along, c) * (filled + (1.0 - filled) * whole)
+                other = self.around(node, c, 1)
+                own, _sign = self.owner(walls, other)
+                self.spread[self.place(grid.linear_index(own))] = -1.0
+                self.marked[self.row_of(own)] = 1
+                centre += weight * self.colliders.place_of(other)
+            self.weights[p * self.stencil + c] = weight
+            total += weight
+        self.share[p], self.gain[p] = total, acts
+        self.lift[p] = self.rate[self.run] * ti.max(over / RISE - SLACK, 0.0)
+        for a in ti.static(range(d)):
+            self.centre[p][a] = centre[a] / ti.max(total, LEAST)
+
+    @ti.func
+    def fill_stencil(
+        self, grid: ti.template(), walls: ti.template(), node: ti.template(), along: ti.template(), p: int
+    ):
+        """Set the weights of point p to the masses that the nodes would have without colliders.
+
+        A node that is held counts as filled, but with a negative sign, because it will have no weight. Return the mass
+        of a full node, kg, and the share of the kernel of the point by which the material fills more than the outside.
+        """
+        d = ti.static(self.dimension)
+        most, held, room, outer, outside = 0.0, 0.0, 0.0, 0.0, 0.0
+        for c in range(self.stencil):
+            own, _sign = self.owner(walls, self.around(node, c, 1))
+            index = grid.linear_index(own)
+            mass, free = grid.nodes[index][d], self.free[self.place(index)]
+            filled = 0.0
+            if mass > 0.0:
+                for a in ti.static(range(d)):
+                    if ti.static(a not in walls.periodic):
+                        if own[a] == walls.first or own[a] == walls.last[a]:
+                            mass *= 2.0
+                weight, share = self.weight(along, c), ti.abs(free)
+                held += weight * mass
+                room += weight * share
+                if free > FREE:
+                    most = ti.max(most, mass / free)
+                if free > OUTER:
+                    outer += mass
+                    outside += free
+                filled = ti.select(free < 0.0, -1.0, 1.0) * mass / ti.max(share, LEAST)
+            self.weights[p * self.stencil + c] = filled
+        full, over = ti.min(most, self.density[self.run]), 0.0
+        if full > 0.0:
+            over = held / ti.max(outer / ti.max(outside, LEAST), full) - room
+        return full, over
+
+    # Sums.
+
+    @ti.func
+    def images_of(self, walls: ti.template(), node: ti.template()):
+        """Return the depths, mirrors and sides of a node at walls, and whether each acts; see `Walls.place`."""
+        depth, mirror, upper = walls.place(node)
+        return depth, mirror, upper, walls.acting(node, depth, mirror, upper)
+
+    @ti.func
+    def spread_out(self, grid: ti.template(), walls: ti.template(), node: ti.template()):
+        """Sum the weights of all points at a node and its images."""
+        own = self.place(grid.linear_index(node))
+        if self.spread[own] < 0.0:
+            self.count[self.run] = 0
+            total = self.gathered(grid, walls, node, False)
+            self.spread[own] = total[0]
+
+    @ti.func
+    def gathered(self, grid: ti.template(), walls: ti.template(), node: ti.template(), pushes: ti.template()):
+        """Return the sum over the points of their weights at a node and its images, or if `pushes` of the impulses."""
+        total = ti.Vector.zero(float, self.dimension)
+        if walls.near(node):
+            depth, mirror, upper, acts = self.images_of(walls, node)
+            for images in range(ti.static(2**self.dimension)):
+                place, sign, exists = node, ti.Vector.one(float, self.dimension), True
+                for a in ti.static(range(self.dimension)):
+                    if images >> a & 1 == 1:
+                        exists = exists and acts[a] == 1 and depth[a] >= 1
+                        place[a] = mirror[a]
+                        self.reflect(walls, a, upper, sign)
+                if exists:
+                    self.gather(grid, place, sign, total, pushes)
+        else:
+            self.gather(grid, node, ti.Vector.one(float, self.dimension), total, pushes)
+        return total
+
+    @ti.func
+    def gather(
+        self,
+        grid: ti.template(),
+        node: ti.template(),
+        sign: ti.template(),
+        total: ti.template(),
+        pushes: ti.template(),
+    ):
+        """Add to the total what the points around a node give to it, in order."""
+        for c in range(self.stencil):
+            beside = self.around(node, c, -1)
+            if grid.in_use(beside) and self.busy[self.row_of(beside)] == 1:
+                p = self.head[self.place(grid.linear_index(beside))] - 1
+                while p >= 0:
+                    weight = self.weights[p * self.stencil + c] * self.part[p]
+                    if ti.static(pushes):
+                        for a in ti.static(range(self.dimension)):
+                            total[a] += weight * sign[a] * self.given[p][a]
+                    else:
+                        total[0] += weight
+                    p = self.next[p] - 1
+
+    @ti.func
+    def weigh(self, grid: ti.template(), walls: ti.template(), node: ti.template(), meets: ti.template()):
+        """Find the gain of the points of a node, and their impulses, unless rigid bodies have yet to be met."""
+        d = ti.static(self.dimension)
+        p = self.head[self.place(grid.linear_index(node))] - 1
+        while p >= 0:
+            resistance, seen = 0.0, ti.Vector.zero(float, d)
+            for c in range(self.stencil):
+                weight = self.weights[p * self.stencil + c]
+                if weight > 0.0:
+                    own, sign = self.owner(walls, self.around(node, c, 1))
+                    index = grid.linear_index(own)
+                    resistance += weight * self.spread[self.place(index)] / grid.nodes[index][d]
+                    for a in ti.static(range(d)):
+                        seen[a] += weight * sign[a] * grid.nodes[index][a]
+            # The impulse that stops the material if all points act alike.
+            self.gain[p] = self.gain[p] / resistance if resistance > 0.0 else 0.0
+            for a in ti.static(range(d)):
+                self.given[p][a] = seen[a]
+            if ti.static(not meets):
+                self.settle_point(node, p)
+            p = self.next[p] - 1
+
+    @ti.func
+    def settle(self, grid: ti.template(), node: ti.template()):
+        """Find the impulses of the points of a node."""
+        p = self.head[self.place(grid.linear_index(node))] - 1
+        while p >= 0:
+            self.settle_point(node, p)
+            p = self.next[p] - 1
+
+    @ti.func
+    def settle_point(self, node: ti.template(), p: int):
+        """Find the impulse of a point, and add it to the loads of its collider."""
+        i = self.run * self.colliders.capacity + self.collider[p]
+        given, _grip = self.impulse(p)
+        for a in ti.static(range(self.dimension)):
+            self.given[p][a] = given[a]
+        if ti.static(not self.colliders.deterministic):
+            taken = -(self.share[p] * self.part[p]) * given
+            arm = self.centre[p] - self.colliders.place[i]
+            self.colliders.loads.take(self.run, node, self.collider[p], taken, arm)
+
+    @ti.func
+    def add_row(self, grid: ti.template(), q: int):
+        """Add to the loads of collider q % capacity the impulses of the points of a row of nodes, in order."""
+        d = ti.static(self.dimension)
+        (loads,) = ti.static((self.colliders.loads,))
+        k, rest = q % self.colliders.capacity, q // self.colliders.capacity
+        i, node = self.run * self.colliders.capacity + k, ti.Vector.zero(int, d)
+        for b in ti.static(range(d - 1)):
+            a = ti.static(d - 2 - b)
+            node[a] = rest % ti.static(self.colliders.shape[a])
+            rest = rest // ti.static(self.colliders.shape[a])
+        total = ti.Vector.zero(float, ti.static(self.colliders.loads.width))
+        for n in range(ti.static(self.colliders.shape[-1])):
+            node[ti.static(d - 1)] = n
+            if grid.in_use(node):
+                p = self.head[self.place(grid.linear_index(node))] - 1
+                while p >= 0:
+                    if self.collider[p] == k:
+                        arm = self.centre[p] - self.colliders.place[i]
+                        total -= loads.of((self.share[p] * self.part[p]) * self.given[p], arm)
+                    p = self.next[p] - 1
+        row = self.run * self.colliders.loads.rows * self.colliders.capacity + q
+        self.colliders.loads.taken[row] = self.colliders.loads.taken[row] + total
+
+    @ti.func
+    def impulse(self, p: int):
+        """Return the impulse per weight on the material at a point, N s, and the effect, see `Colliders.met`."""
+        i = self.run * self.colliders.capacity + self.collider[p]
+        arm, normal = self.centre[p] - self.colliders.place[i], self.normal[p]
+        own = self.colliders.velocity[i] + self.colliders.turning[i] @ arm
+        relative = self.given[p] - self.share[p] * (own + self.lift[p] * normal)
+        away = relative.dot(normal)
+        along = relative - away * normal
+        result, grip = ti.Vector.zero(float, self.dimension), LOOSE
+        if self.colliders.wall[i] == STICK:
+            result, grip = -self.gain[p] * relative, HELD
+        elif away < 0.0 or self.colliders.wall[i] != SEPARATE:
+            push, size = -self.gain[p] * away, self.gain[p] * along.norm()
+            result, grip = push * normal, PRESSED
+            bound = self.colliders.friction[i] * ti.max(push, 0.0)
+            if bound > 0.0 and size > 0.0:
+                result -= ti.min(1.0, bound / size) * self.gain[p] * along
+                if bound >= size:
+                    grip = HELD
+        return result, grip
+
+    @ti.func
+    def meet(self, grid: ti.template(), node: ti.template(), rigid: ti.template()):
+        """Add to the sums of rigid bodies the impulses that the points of a node would give to them."""
+        d = ti.static(self.dimension)
+        p = self.head[self.place(grid.linear_index(node))] - 1
+        while p >= 0:
+            for j in range(rigid.count):
+                b, i = self.run * rigid.count + j, rigid.collider_of(self.run, j)
+                if rigid.settled[b] == 0 and i == self.run * self.colliders.capacity + self.collider[p]:
+                    given, grip = self.impulse(p)
+                    if grip != LOOSE:
+                        arm, normal = self.centre[p] - self.colliders.place[i], self.normal[p]
+                        scale = self.share[p] * self.part[p]
+                        (loads,) = ti.static((self.colliders.loads,))
+                        row = (self.run * loads.rows + loads.row_of(node)) * rigid.count + j
+                        load = loads.of(-scale * given, arm)
+                        for a in ti.static(range(rigid.loads)):
+                            rigid.sums[row, a] = rigid.sums[row, a] + ti.cast(load[a], ti.f64)
+                        directions = 1
+                        if grip == HELD:
+                            directions += ti.static(d - 1)
+                        for c in range(directions):
+                            along = normal
+                            if grip == HELD:
+                                for a in ti.static(range(d)):
+                                    along[a] = ti.cast(a == c, float)
+                            lever = ti.cast(loads.of(along, arm), ti.f64)
+                            rigid.resist(row, lever, scale * self.share[p] * self.gain[p])
+            p = self.next[p] - 1
+
+    @ti.func
+    def push(self, grid: ti.template(), walls: ti.template(), node: ti.template()):
+        """Give the impulses of the points to a node and its images; return the squared speed of the node."""
+        d = ti.static(self.dimension)
+        index, squared = grid.linear_index(node), 0.0
+        own = self.place(index)
+        if self.spread[own] > 0.0:
+            self.spread[own] = 0.0
+            change = self.gathered(grid, walls, node, True) / grid.nodes[index][d]
+            if walls.near(node):
+                self.change_images(grid, walls, node, change)
+            else:
+                for a in ti.static(range(d)):
+                    grid.nodes[index][a] = grid.nodes[index][a] + change[a]
+            # Nodes inside, and light ones, hardly move particles.
+            free = ti.abs(self.free[own])
+            if free > 0.5 and grid.nodes[index][d] > LIGHT * free * self.density[self.run]:
+                for a in ti.static(range(d)):
+                    squared += grid.nodes[index][a] ** 2
+        return squared
+
+    @ti.func
+    def change_images(self, grid: ti.template(), walls: ti.template(), node: ti.template(), change: ti.template()):
+        """Change the velocity of a node near a wall and of its images."""
+        d = ti.static(self.dimension)
+        depth, mirror, upper, acts = self.images_of(walls, node)
+        way = change
+        for a in ti.static(range(d)):
+            if acts[a] == 1 and depth[a] == 0:
+                holds = walls.face_is("stick", a, upper[a])
+                for c in ti.static(range(d)):
+                    if ti.static(c == a):
+                        way[c] = 0.0
+                    elif holds:
+                        way[c] = 0.0
+        for images in range(ti.static(2**d)):
+            place, sign, exists = node, ti.Vector.one(float, d), True
+            for a in ti.static(range(d)):
+                if images >> a & 1 == 1:
+                    exists = exists and acts[a] == 1 and depth[a] >= 1
+                    place[a] = mirror[a]
+                    self.reflect(walls, a, upper, sign)
+            if exists:
+                index = grid.linear_index(place)
+                for a in ti.static(range(d)):
+                    grid.nodes[index][a] = grid.nodes[index][a] + sign[a] * way[a]
+
+
+# The bodies of the phases, functions of a node. Points exist in layer 0 alone.
+
+
+@ti.func
+def fill_solids(at: ti.template(), node: ti.template(), _kick: float):
+    """Count colliders as filled, in steps that relax volumes."""
+    if at.nodes.colliders.own == 0 and at.step.relaxed > 0.0:
+        at.points.fill(at.grid, at.nodes.images.walls, node)
+
+
+@ti.func
+def find_points(at: ti.template(), node: ti.template(), _kick: float):
+    """Find the points of a node."""
+    if at.nodes.colliders.own == 0:
+        at.points.find(at.grid, at.nodes.images.walls, at.particles.extent, node)
+
+
+@ti.func
+def spread_points(at: ti.template(), node: ti.template(), _kick: float):
+    """Sum the weights of points at a node."""
+    if at.nodes.colliders.own == 0:
+        at.points.spread_out(at.grid, at.nodes.images.walls, node)
+
+
+@ti.func
+def weigh_points(at: ti.template(), node: ti.template(), _kick: float):
+    """Find the gains of the points of a node, and without rigid bodies their impulses."""
+    if at.nodes.colliders.own == 0:
+        at.points.weigh(at.grid, at.nodes.images.walls, node, at.nodes.couples)
+
+
+@ti.func
+def meet_points(at: ti.template(), node: ti.template(), _kick: float):
+    """Add the impulses of the points of a node to the sums of rigid bodies."""
+    at.points.meet(at.grid, node, at.nodes.rigid)
+
+
+@ti.func
+def settle_points(at: ti.template(), node: ti.template(), _kick: float):
+    """Find the impulses of the points of a node after rigid bodies have been met."""
+    at.points.settle(at.grid, node)
+
+
+@ti.func
+def push_points(at: ti.template(), node: ti.template(), _kick: float):
+    """Give the impulses of points to a node."""
+    if at.nodes.colliders.own == 0:
+        squared = at.points.push(at.grid, at.nodes.images.walls, node)
+        if ti.static(at.atomic):
+            at.peaks.include(at.w, 0, squared)
+        elif squared > at.step.speed_squared:
+            ti.atomic_max(at.step.speed_squared, squared)
+
+
+# Whether a phase has work in the row of nodes that begins at a node.
+
+
+@ti.func
+def near_row(at: ti.template(), node: ti.template()):
+    """Return whether the row may be near a collider."""
+    return at.points.near_row(node)
+
+
+@ti.func
+def new_row(at: ti.template(), node: ti.template()):
+    """Return whether the row may be near a collider; no point of it is found yet."""
+    at.points.busy[at.points.row_of(node)] = 0
+    return at.points.near_row(node)
+
+
+@ti.func
+def busy_row(at: ti.template(), node: ti.template()):
+    """Return whether the row has points."""
+    return at.points.busy[at.points.row_of(node)] == 1
+
+
+@ti.func
+def marked_row(at: ti.template(), node: ti.template()):
+    """Return whether a point has weights in the row."""
+    return at.points.marked[at.points.row_of(node)] == 1
+
+
+@ti.func
+def last_row(at: ti.template(), node: ti.template()):
+    """Return whether a point has weights in the row, for the last time in a step."""
+    row = at.points.row_of(node)
+    marked = at.points.marked[row]
+    at.points.marked[row] = 0
+    return marked == 1
