@@ -365,7 +365,6 @@ def test_turning_colliders_are_where_their_motion_says(backend_of: Callable, dim
         solver={"precision": "f64"},
         bodies=[{"name": "b", "material": JELLY, "shape": ball}],
     )
-    # All nodes of the body are held, which the checks of a scene refuse.
     scene = with_colliders(scene, [post, held])
     frames = run(scene, backend_of("f64", 1))
     start, end = (frame.position.astype(float) for frame, _ in (frames[0], frames[-1]))

@@ -91,7 +91,7 @@ class ColliderPoints:
 
     @staticmethod
     def room(nodes: int, dimension: int) -> int:
-        """Return the largest number of points of a run with this number of nodes."""
+        """Return the largest number of points of a run with this number of nodes: surfaces are fewer than volumes."""
         return nodes if dimension == 2 else min(nodes, nodes // 6 + 1000)
 
     @staticmethod

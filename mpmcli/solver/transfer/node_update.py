@@ -20,6 +20,7 @@ class NodeUpdate:
         colliders: colliders, which constrain it after the walls; None if there are none.
         rigid: freely moving rigid bodies; None if there are none.
         points: contact at points of the surfaces of colliders, in layer 0; None if there is none.
+        couples, touches: whether `rigid` and `points` are not None; Taichi cannot compare with None.
     """
 
     def __init__(
