@@ -325,3 +325,44 @@ def test_resting_fluid_stays_on_a_separating_floor(backend_of: Callable, record_
     assert fastest < 0.01 * np.sqrt(g * height)
     assert moved < 0.25
     assert error < 0.05
+
+
+@pytest.mark.parametrize("rows", [8, 1])
+@pytest.mark.parametrize(
+    "material",
+    [
+        {"law": "fluid", "density": 1000.0, "bulk_modulus": 8e5},
+        {"law": "sand", "density": 1600.0, "youngs_modulus": 6e5, "poissons_ratio": 0.3, "friction_angle": 35.0},
+    ],
+    ids=["water", "sand"],
+)
+def test_what_falls_on_a_separating_wall_meets_it_where_it_is(backend_of: Callable, material: dict, rows: int) -> None:
+    """Rows of cells that fall three cells fall freely to a third of a cell, and then lie on the wall.
+
+    The lowest particles start a quarter of a cell above the lower side. Material that acted on the wall as soon as its
+    kernel reached it was stopped 0.8 to 0.95 cells above it, and a single row stayed 0.65 cells above.
+    """
+    g, size = 9.81, 2.4
+    asked = scene_of(
+        domain={
+            "size": [size, 1.5],
+            "spacing": H,
+            "gravity": [0.0, -g],
+            "walls": {"default": "slip", "y_min": "separate"},
+        },
+        time={"end": 2.4, "frames": 480},
+        bodies=[
+            {
+                "name": "body",
+                "material": material,
+                "shape": {"box": {"min": [0.0, 3 * H], "max": [size, (3 + rows) * H]}},
+            }
+        ],
+    )
+    frames = [frame for frame, _ in build_run(asked, backend_of("f32", 1)).frames()]
+    gap = {frame.time: frame.position[:, 1].min() / H - 0.25 for frame in frames}
+    slowed = next(f.time for f in frames if f.time > 0.1 and f.velocity[:, 1].mean() > -0.985 * g * f.time)
+    assert -0.1 < gap[slowed] < 1 / 3
+    level = np.mean([frame.position[:, 1].mean() for frame in frames[-80:]]) / H
+    # A single row has no weight on it that would press it down.
+    assert level == pytest.approx(rows / 2, abs=0.12 if rows > 1 else 1 / 3)

@@ -8,8 +8,14 @@ second-order accurate; setting nodal velocities to zero is first-order accurate 
 from collections.abc import Sequence
 from copy import copy
 
-from mpmcli.boundaries.walls import REACH, Walls
+from mpmcli.boundaries.walls import AWAY, REACH, Walls
 from mpmcli.quick_taichi import ti
+
+# A separating wall acts where the node on it is filled to the fraction REACHED of that inside. Half of its kernel is
+# outside, so that the filled fraction is twice its mass. Material that comes near is then a fifth of a cell away. The
+# wall acts too where the node beyond has CLOSE of the mass of the node on it, half of what material that touches gives:
+# light material under heavy fills the node on the wall to less.
+REACHED, CLOSE = 0.75, 0.02
 
 
 @ti.data_oriented
@@ -267,7 +273,7 @@ class MirrorImages:
         """Store whether the material presses on the q-th node in use of the plane of every separating face.
 
         A separating wall only pushes: it acts where the momentum of its node, with the forces of this step, points into
-        it.
+        it, and where the material has reached it, see `REACHED`.
         """
         for f in ti.static(range(len(self.walls.separating))):
             axis = ti.static(self.walls.separating[f][0])
@@ -275,6 +281,12 @@ class MirrorImages:
             node, inside = self.plane_node(grid, q, axis, upper)
             if inside:
                 value = pulled(grid.part(grid.linear_index(node), 0), self.dimension, gravity_step)
+                inner, outer = node, node
+                inner[axis] += ti.static(-1 if upper else 1)
+                outer[axis] -= ti.static(-1 if upper else 1)
+                mass = self.mass_at(grid, node)
+                reached = 2 * mass >= REACHED * self.mass_at(grid, inner)
+                reached = reached or self.mass_at(grid, outer) >= CLOSE * mass
                 if ti.static(self.crossed[axis]):
                     # Contributions that other walls fold onto this node are pressed or pulled with it.
                     depth, mirror, upper_side = self.walls.place(node)
@@ -288,7 +300,21 @@ class MirrorImages:
                 if ti.static(not upper):
                     outward = -outward
                 place = self.walls.plane_index(node, axis)
-                self.walls.contact[self.walls.first_plane + f, place] = ti.cast(outward >= 0, int)
+                acting = ti.cast(outward >= 0, int)
+                if not reached:
+                    acting = AWAY
+                self.walls.contact[self.walls.first_plane + f, place] = acting
+
+    @ti.func
+    def mass_at(self, grid: ti.template(), node: ti.template()):
+        """Return the mass of a node and of its images at periodic faces, kg, before they are summed."""
+        mass = grid.nodes[grid.linear_index(node)][self.dimension]
+        if ti.static(len(self.walls.periodic) > 0):
+            for images in range(1, ti.static(2**self.dimension)):
+                image, exists = grid.period.image(node, images)
+                if exists:
+                    mass += grid.nodes[grid.linear_index(image)][self.dimension]
+        return mass
 
 
 @ti.func
@@ -381,7 +407,7 @@ def column_friction(
         if a == axis:
             pressed = acts[a] == 1
             acts[a] = 0
-        others += acts[a]
+        others = ti.max(others, acts[a])
     taken, slip = ti.Vector.zero(float, d), ti.Vector.zero(float, d)
     compliance = 0.0
     if pressed:

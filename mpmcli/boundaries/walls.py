@@ -20,6 +20,8 @@ REACH = 2
 PERIODIC_REACH = 3
 # Condition of a face that is not a wall.
 OPEN = "open"
+# Entry of `Walls.contact` where the material has yet to reach the wall (docs/theory.md, 3.2).
+AWAY = -1
 
 
 def moving_faces(scene: Scene) -> tuple[tuple[int, int], ...]:
@@ -118,7 +120,8 @@ class Walls:
         lateral: per axis, the other axes.
         separating: (axis, side) of every face with the condition "separate".
         axes: axes whose faces are considered: all, or fewer for nodes that are near no other faces, see `along`.
-        contact: (planes, nodes) int, per separating face and node of its plane, whether the material presses on it.
+        contact: (planes, nodes) int, per separating face and node of its plane, whether the material presses on it: 1,
+            0, or AWAY.
         first_plane: row of `contact` of the first separating face.
         friction: the coefficients of friction.
         rough: of every wall with friction: its index in `rough`, its index in `friction`, axis and side.
@@ -194,7 +197,7 @@ class Walls:
         for a in ti.static(self.axes):
             if acts[a] == 1 and depth[a] == 0:
                 result = self.stopped(result, a, holds, upper, 1.0)
-            elif depth[a] <= self.shut:
+            elif acts[a] != AWAY and depth[a] <= self.shut:
                 inward = result[a] if upper[a] == 0 else -result[a]
                 if inward < 0:
                     result[a] = 0.0
