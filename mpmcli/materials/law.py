@@ -77,6 +77,7 @@ class Law(ABC):
         parameters: pydantic model of the parameters, which also lists the internal variables.
         deformation: stored deformation, "J" (volume ratio) or "F" (deformation gradient).
         projects: whether `respond` may change the state.
+        levels: whether particles of a cell take their mean volume in steps that relax volumes, unless f_bar is given.
         relaxes: whether `relax` moves the volume towards its value on the grid (docs/theory.md, 5.11).
         grows_by_constants: whether `grown` reads the constants.
         stiffness_parameters, viscosity_parameters: names of the parameters that set the stiffness and the viscosity;
@@ -100,6 +101,7 @@ class Law(ABC):
     parameters: ClassVar[type[MaterialParameters]]
     deformation: ClassVar[Literal["J", "F"]]
     projects: bool = False
+    levels: ClassVar[bool] = False
     relaxes: bool = False
     grows_by_constants: bool = False
     coherent: ClassVar[bool] = False

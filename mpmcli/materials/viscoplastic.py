@@ -86,6 +86,7 @@ class Viscoplastic(Law):
     projects = True
     coherent = True
     flows = True
+    levels = True
 
     def __init__(self, members: tuple[ViscoplasticParameters, ...], dimension: int) -> None:
         super().__init__(members, dimension)

@@ -177,7 +177,8 @@ class SolverSettings(Table):
         "auto",
         description="Whether particles of a cell share their change of volume (F-bar), so that material that "
         'hardly changes its volume does not lock. "auto": those of laws of which a body has a Poisson\'s ratio of '
-        f"more than {NEARLY_INCOMPRESSIBLE:g}, and does not flow.",
+        f"more than {NEARLY_INCOMPRESSIBLE:g}, and does not flow; those of viscoplastic fluids take their mean volume "
+        "in one step of fifty.",
     )
     grid: Literal["auto", "dense", "sparse"] = Field(
         "auto",

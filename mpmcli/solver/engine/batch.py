@@ -48,7 +48,7 @@ from mpmcli.solver.transfer.node_update import NodeUpdate
 from mpmcli.solver.transfer.particle_update import BEYOND, ParticleUpdate
 from mpmcli.solver.transfer.redistribution import FineBlocks, FineGrid
 from mpmcli.solver.transfer.splines import PAD, scheme_of
-from mpmcli.solver.transfer.volume import averages_volume
+from mpmcli.solver.transfer.volume import averages_volume, levels_volume
 
 # Factor from the required to the allocated blocks when a sparse grid is enlarged.
 GROWTH = 2
@@ -108,6 +108,7 @@ class Batch:
                 keeps_initial=forces.initial,
                 total=kind.settings.solids == "total",
                 uses_f_bar=shares,
+                levels=levels_volume(kind.settings, law),
                 has_wall_friction=slips_in(kind.settings, kind.rough),
                 comes_and_goes=kind.inflow.any,
                 layers=kind.layers.count,
@@ -220,7 +221,7 @@ class Batch:
             self.runs,
             tile=tile,
             keeps_filling=kind.keeps_filling,
-            uses_f_bar=[averages_volume(kind.settings, law) for law in kind.members],
+            averages=[averages_volume(kind.settings, law) or levels_volume(kind.settings, law) for law in kind.members],
             period=period,
             opens=kind.inflow.opens,
             deterministic=deterministic,

@@ -441,11 +441,14 @@ class CpuPhases(RunPhases):
 
     @ti.func
     def average(self, at: ti.template()):
-        """Add particles of the g-th group to the averages of their cells."""
-        if at.turn < self.colours:
+        """Add particles of the g-th group to the averages of their cells; groups that level need them in some steps."""
+        needed = at.step.relaxed > 0.0
+        if ti.static(at.group.uses_f_bar):
+            needed = True
+        if needed and at.turn < self.colours:
             first, after = self.pencils(at.order, at.turn, at.region, at.part)
             average_pencils(at, first, after)
-        elif at.region == 0 and at.part == 0:
+        elif needed and at.region == 0 and at.part == 0:
             first, after = self.come_in(at.g, at.order, at.run)
             average_range(at.grid, at.g, at.group, first, after, at.step.dt)
 
@@ -472,7 +475,7 @@ class CpuPhases(RunPhases):
             change = 0.0
             for p in range(first, after):
                 stay_rolled(at.order.buffers.real, p)
-                change = ti.max(change, at.particles.relax(self.device.groups[at.g], p, relaxed))
+                change = ti.max(change, at.particles.relax(at.g, self.device.groups[at.g], p, relaxed))
             ti.atomic_max(at.step.volume_change[at.g], change)
 
     @ti.func

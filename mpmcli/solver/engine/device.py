@@ -87,7 +87,8 @@ class Device:
         """The phases of a step."""
         return step_phases(
             [group.law for group in self.groups],
-            [group.uses_f_bar for group in self.groups],
+            [group.averages for group in self.groups],
+            [group.levels for group in self.groups],
             contact=self.nodes.needs_contact and (self.contact is None or self.contact.surfaces.shares),
             friction=self.nodes.needs_friction,
             deterministic=self.grid.deterministic,

@@ -166,8 +166,12 @@ class GpuPhases(RunPhases):
 
     @ti.func
     def average(self, at: ti.template()):
-        """Add a particle to the sums of its cell."""
-        add_volume(at.grid, at.g, at.group, at.q, at.step.dt)
+        """Add a particle to the sums of its cell, in steps that need them."""
+        needed = at.step.relaxed > 0.0
+        if ti.static(at.group.uses_f_bar):
+            needed = True
+        if needed:
+            add_volume(at.grid, at.g, at.group, at.q, at.step.dt)
 
     @ti.func
     def scatter(self, at: ti.template()):
@@ -190,7 +194,7 @@ class GpuPhases(RunPhases):
     def relax(self, at: ti.template()):
         """Relax the volume of a particle in steps that relax volumes."""
         if at.step.relaxed > 0.0:
-            change = at.particles.relax(self.device.groups[at.g], at.q, at.step.relaxed)
+            change = at.particles.relax(at.g, self.device.groups[at.g], at.q, at.step.relaxed)
             self.peaks.include(at.w, 2 + 2 * at.g, change)
 
     @ti.func

@@ -61,7 +61,8 @@ class Phase:
 
 def step_phases(
     laws: Sequence[Law],
-    uses_f_bar: Sequence[bool],
+    averages: Sequence[bool],
+    levels: Sequence[bool],
     *,
     contact: bool,
     friction: bool,
@@ -79,7 +80,8 @@ def step_phases(
 
     Args:
         laws: the laws, one per group.
-        uses_f_bar: for each law, whether the changes of volume of its particles are averaged over cells.
+        averages: for each law, whether the changes of volume of its particles are averaged over cells.
+        levels: for each law, whether its particles take the average.
         contact: whether material can separate from any wall.
         friction: whether any wall has friction.
         deterministic: whether P2G is in fixed point.
@@ -94,12 +96,12 @@ def step_phases(
     return (
         *(shift_phases(laws, shifts, deterministic=deterministic) if shifts else ()),
         Phase("clear", "nodes"),
-        *(Phase("average", "particles", g, adds=True) for g in groups if uses_f_bar[g]),
+        *(Phase("average", "particles", g, adds=True) for g in groups if averages[g]),
         *(Phase("scatter", "particles", g, adds=True) for g in groups),
         *[Phase("to_float", "nodes")] * deterministic,
         *[Phase("fill_solids", "nodes", body=touch.fill_solids, wanted=touch.near_row)]
         * (points and any(law.relaxes for law in laws)),
-        *(Phase("relax", "particles", g) for g in groups if laws[g].relaxes),
+        *(Phase("relax", "particles", g) for g in groups if laws[g].relaxes or levels[g]),
         *[Phase("find_bodies", "nodes")] * separates,
         *(Phase("show_surface", "particles", g) for g in groups if separates and laws[g].surfaced),
         *[Phase("link_surfaces", "particles")] * (separates and serial),

@@ -113,7 +113,7 @@ class FixedPoint:
         sums = partial(FixedSums, count=grid.runs * grid.node_count, wide=arch in WIDE)
         self.nodes = sums(grid.width)
         self.filling = sums(grid.kept) if grid.keeps_filling else None
-        self.means = tuple(sums(4) if group.uses_f_bar else None for group in groups)
+        self.means = tuple(sums(4) if group.averages else None for group in groups)
         wide, fine = arch in WIDE, grid.fine
         self.fine = FixedSums(1, grid.runs * fine.node_count, wide=wide) if fine else None
         self.of_fine = self.fine.scale(CROWDED) if fine else 0.0

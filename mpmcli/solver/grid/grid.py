@@ -119,13 +119,13 @@ class Grid(LinearNodes):
         *,
         tile: int,
         keeps_filling: bool,
-        uses_f_bar: Sequence[bool],
+        averages: Sequence[bool],
         period: Period,
         opens: Sequence[tuple[int, int]],
         deterministic: bool,
         layers: int = 1,
     ) -> None:
-        """Allocate nodes for `runs` runs; `uses_f_bar` states for each group whether it averages volumes over cells."""
+        """Allocate nodes for `runs` runs; `averages` states for each group whether it averages volumes over cells."""
         self.dimension, self.kept = dimension, width
         self.parts = (0, width) if scheme.keeps_flip_velocity else (0,)
         self.width = width * len(self.parts)
@@ -146,7 +146,7 @@ class Grid(LinearNodes):
         self.filling = ti.Vector.field(width, float, shape=count) if keeps_filling else None
         self.holding = self.filling if keeps_filling else self.nodes
         self.means = tuple(
-            ti.Vector.field(4, float, shape=count) if wanted and not deterministic else None for wanted in uses_f_bar
+            ti.Vector.field(4, float, shape=count) if wanted and not deterministic else None for wanted in averages
         )
         self.kept_means = tuple(means for means in self.means if means is not None)
         self.period = period

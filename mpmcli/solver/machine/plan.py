@@ -44,7 +44,7 @@ from mpmcli.solver.particles.sort import TileOrder
 from mpmcli.solver.transfer.kept_motion import keeps_motion
 from mpmcli.solver.transfer.redistribution import fine_nodes
 from mpmcli.solver.transfer.splines import scheme_of
-from mpmcli.solver.transfer.volume import averages_volume, needs_filling
+from mpmcli.solver.transfer.volume import averages_volume, levels_volume, needs_filling
 
 # Smallest numbers of entries and of colliders for which arrays have space.
 FEWEST, FEWEST_COLLIDERS = 1024, 4
@@ -278,7 +278,8 @@ def passes_of(members: Sequence[Law], scene: Scene, *, deterministic: bool = Fal
     layers = Layers.of(scene)
     phases = step_phases(
         members,
-        [averages_volume(scene.solver, law) for law in members],
+        [averages_volume(scene.solver, law) or levels_volume(scene.solver, law) for law in members],
+        [levels_volume(scene.solver, law) for law in members],
         contact=layers.shares and bool(_separating_axes(scene)),
         friction=bool(_rough_axes(scene)),
         deterministic=deterministic,
@@ -322,6 +323,7 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
         counts[emitter.material.law] += sheets_of(emitter, scene).particles
     members = law_objects(scene)
     averaged = [averages_volume(scene.solver, law) for law in members]
+    summed = sum(averaged) + sum(levels_volume(scene.solver, law) for law in members)
     require_contact_possible(scene, backend)
     _require_rigid_possible(scene)
     fields_of = Layers.of(scene)
@@ -338,6 +340,7 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
                 keeps_initial=scene.solver.solids == "total"
                 or needs_initial(scene, names_of(scene, members_of(scene, name))),
                 uses_f_bar=shares,
+                levels=levels_volume(scene.solver, member),
                 total=scene.solver.solids == "total",
                 has_wall_friction=slips_in(scene.solver, rough_faces(scene)),
                 comes_and_goes=scene.comes_and_goes,
@@ -357,15 +360,14 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
         nodes = blocks * tile**dimension
     filling, deterministic = needs_filling(scene, members, fields_of), scene.solver.deterministic and not backend.on_cpu
     numbers = layers * width * (1 + scheme.keeps_flip_velocity + filling)
-    node_bytes = real * (numbers + layers * 4 * sum(averaged))
+    node_bytes = real * (numbers + layers * 4 * summed)
     # 0 without shifts.
     fine = fine_nodes(scene, members) ** dimension
     node_bytes += real * fine
     if deterministic:
-        shared = sum(averaged)
-        node_bytes += FixedPoint.bytes_needed(numbers, shared) + FixedPoint.bytes_needed(1, 0) * fine
+        node_bytes += FixedPoint.bytes_needed(numbers, summed) + FixedPoint.bytes_needed(1, 0) * fine
         # The fixed-point means replace the floating-point ones.
-        node_bytes -= real * 4 * shared
+        node_bytes -= real * 4 * summed
     all_tiles, bins = all_nodes // tile**dimension, 0
     tables = len(groups) * TileOrder.bytes_needed(blocks if sparse else all_tiles, backend.threads)
     if sparse:

@@ -31,6 +31,7 @@ def particle_fields(
     many_bodies: bool,
     keeps_initial: bool = False,
     uses_f_bar: bool = False,
+    levels: bool = False,
     total: bool = False,
     has_wall_friction: bool = False,
     comes_and_goes: bool = False,
@@ -47,7 +48,7 @@ def particle_fields(
         fields["volume_ratio"] = (float, 1, 1)
     fields |= {name: (float, 1, 1) for name in internal}
     fields |= {"initial_position": (float, d, 1)} if keeps_initial else {}
-    fields |= {"volume_to_mean": (float, 1, 1), "cell": (int, 1, 1)} if uses_f_bar else {}
+    fields |= {"volume_to_mean": (float, 1, 1), "cell": (int, 1, 1)} if uses_f_bar or levels else {}
     fields |= {"volume_growth": (float, 1, 1)} if uses_f_bar and not total else {}
     fields |= {"slip": (float, d, 1)} if has_wall_friction else {}
     fields |= {"surface": (float, d + 1, 1)} if surfaced else {}
@@ -89,7 +90,8 @@ class ParticleArrays:
         initial: initial position relative to the origin, (n) Vector(d), m; stored (`keeps_initial`) if a force needs it
             or the group is `total`.
         uses_f_bar: whether particles of a cell share their change of volume (`transfer.volume`).
-        cell, to_mean: with `uses_f_bar`, the cell of each particle, (n), and its ln J during P2G, (n), or for a frame
+        levels: whether they take their mean volume in some steps; `averages`: whether either holds.
+        cell, to_mean: with `averages`, the cell of each particle, (n), and its ln J during P2G, (n), or for a frame
             the mean of ln J over the cell minus its own.
         growth: growth of ln J in the last step, (n); None unless the group is `evened`.
         evened: whether particles take the mean growth of their cell in G2P, because they change cells: `uses_f_bar` and
@@ -122,6 +124,7 @@ class ParticleArrays:
         keeps_initial: bool = False,
         total: bool = False,
         uses_f_bar: bool = False,
+        levels: bool = False,
         has_wall_friction: bool = False,
         comes_and_goes: bool = False,
         layers: int = 1,
@@ -133,6 +136,7 @@ class ParticleArrays:
         self.real = np.float64 if ti.lang.impl.current_cfg().default_fp == ti.f64 else np.float32
         self.carries = self.real == np.float32
         self.many_bodies, self.serial, self.total, self.uses_f_bar = many_bodies, serial, total, uses_f_bar
+        self.levels, self.averages = levels, uses_f_bar or levels
         self.keeps_initial, self.evened = keeps_initial or total, uses_f_bar and not total
         self.has_wall_friction, self.comes_and_goes = has_wall_friction, comes_and_goes
         self.layers, self.surfaced = layers, surfaced
@@ -144,6 +148,7 @@ class ParticleArrays:
             many_bodies=many_bodies,
             keeps_initial=self.keeps_initial,
             uses_f_bar=uses_f_bar,
+            levels=levels,
             total=total,
             has_wall_friction=has_wall_friction,
             comes_and_goes=comes_and_goes,

@@ -14,7 +14,7 @@ from mpmcli.solver.particles.state_bounds import deformation_rate, volume_ratio
 from mpmcli.solver.transfer.particle_step import Loads, NodeSums, Receiver, Sender, hand_over, loads_on, take_back
 from mpmcli.solver.transfer.splines import PAD
 from mpmcli.solver.transfer.stencils import add_linear, columns, gather_linear
-from mpmcli.solver.transfer.volume import missing_growth, relax_volume
+from mpmcli.solver.transfer.volume import level_volume, missing_growth, relax_volume
 
 
 @ti.func
@@ -137,13 +137,16 @@ class ParticleUpdate:
                 scatter_volume(group.x[p], row[VOLUME], self.grid, True)
 
     @ti.func
-    def relax(self, group: ti.template(), p: int, relaxed: float):
+    def relax(self, g: ti.template(), group: ti.template(), p: int, relaxed: float):
         """Relax the volume of one particle over a time, s, after P2G; return the absolute change of its logarithm."""
         change = 0.0
         _v, C = group.motion(p)
         # A particle at rest is not relaxed.
         if deformation_rate(group, C) > 0.0:
-            change = relax_volume(group, self.grid, self.last, p, group.x[p], relaxed)
+            if ti.static(group.levels):
+                change = level_volume(self.grid, g, group, p)
+            else:
+                change = relax_volume(group, self.grid, self.last, p, group.x[p], relaxed)
         return change
 
     @ti.func

@@ -4,7 +4,8 @@ Particles of a cell may share their change of volume, so that nearly incompressi
 receives F (J'/J)^(1/d), where ln J' is the mean of ln J over the particles of the cell, weighted by their volumes at
 rest: F-bar (de Souza Neto et al. 1996) with the projection of B-bar (Hughes 1980). If particles change cells
 (`ParticleArrays.evened`), F itself takes the mean growth of ln J of its cell. See docs/theory.md, 4.4. This code is
-compiled only for groups with `ParticleArrays.uses_f_bar`.
+compiled only for groups with `ParticleArrays.averages`. Laws with `levels` take the mean of ln J into their state, in
+the steps that relax volumes.
 
 The volumes of liquids and grains relax towards the density on the grid (docs/theory.md, 5.11). This code is compiled
 only for laws with `Law.relaxes` and runs in one step of every `INTERVAL`.
@@ -39,6 +40,11 @@ def averages_volume(settings: SolverSettings, law: Law) -> bool:
     if settings.f_bar == "auto":
         return law.locks
     return settings.f_bar and law.deformation == "F"
+
+
+def levels_volume(settings: SolverSettings, law: Law) -> bool:
+    """Return whether the particles of a law take the mean volume of their cell in steps that relax volumes."""
+    return settings.f_bar == "auto" and law.levels
 
 
 @ti.func
@@ -226,6 +232,14 @@ def needs_filling(scene: Scene, laws: Sequence[Law], layers: Layers) -> bool:
     """
     alike = len({body.material.density for body in scene.sources}) == 1 and layers.count == 1
     return any(law.relaxes for law in laws) and (touched(scene, layers) or not alike)
+
+
+@ti.func
+def level_volume(grid: ti.template(), g: ti.template(), group: ti.template(), p: int):
+    """Give particle p the mean volume of its cell; return the absolute change of its logarithm."""
+    missing = missing_to_mean(grid, g, group, p)
+    group.store(p, group.stored(p) * stretch_to(missing, group.dimension), group.inner(p))
+    return ti.abs(missing)
 
 
 @ti.func
