@@ -354,7 +354,6 @@ class ColliderPoints:
         """Sum the weights of all points at a node and its images."""
         own = self.place(grid.linear_index(node))
         if self.spread[own] < 0.0:
-            self.count[self.run] = 0
             total = self.gathered(grid, walls, node, False)
             self.spread[own] = total[0]
 

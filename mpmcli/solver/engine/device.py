@@ -230,13 +230,14 @@ class RunPhases:
         members: (index, group) of each law.
         moves, rigid: whether colliders move as prescribed, and whether any moves freely.
         separates: whether bodies have their own velocity fields, see `contact.body_contact`.
+        touches: whether colliders act at points of their surfaces.
     """
 
     def __init__(self, device: Device, layout: Layout) -> None:
         self.device, self.layout, self.dimension = device, layout, device.grid.dimension
         self.members = tuple(enumerate(device.groups))
         self.moves, self.rigid = device.motion is not None, device.rigid is not None
-        self.separates = device.contact is not None
+        self.separates, self.touches = device.contact is not None, device.points is not None
         self.values = ti.field(float, shape=(device.runs, layout.widths["step"]))
 
     def state(self, w: object, numbers: object, counts: object) -> RunState:
@@ -271,7 +272,7 @@ class RunPhases:
             self.device.motion.advance(run.w, run.dt)
         if ti.static(self.rigid):
             self.device.rigid.begin(run.w, run.dt, step.kick, self.gravity_of(step))
-        self.forget_extremes(step)
+        self.forget_extremes(step, run.w)
         if ti.static(self.separates):
             self.find_meetings(run)
 
@@ -309,9 +310,11 @@ class RunPhases:
         return ti.static((at.grid.within(box),))
 
     @ti.func
-    def forget_extremes(self, step: ti.template()):
-        """Reset the largest speed and rates of a step."""
+    def forget_extremes(self, step: ti.template(), w: int):
+        """Reset the largest speed and rates of a step of run w, and its number of points on colliders."""
         step.speed_squared, step.broken = 0.0, 0.0
+        if ti.static(self.touches):
+            self.device.points.count[w] = 0
         for g in ti.static(range(len(self.members))):
             # A law may not have particles yet.
             step.rate[g] = 0.0 if ti.static(self.device.comes_and_goes) else NOTHING

@@ -545,7 +545,7 @@ class GpuLaunch:
                     step.gravity[a] = pulled[a]
             if ti.static(self.device.grid.deterministic):
                 self.device.grid.fixed.set_step(w, ti.max(step.kick, step.stable))
-            self.phases.forget_extremes(step)
+            self.phases.forget_extremes(step, w)
             self.phases.forget_peaks(w)
 
     @ti.func
