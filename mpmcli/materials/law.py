@@ -87,6 +87,7 @@ class Law(ABC):
             (docs/theory.md, 4.4).
         flows: whether it is a liquid or grains, whose volume the ledger compares with the volume filled on the grid.
         shifts: whether particles are shifted out of crowds (docs/theory.md, 5.12).
+        opens_at_surfaces: whether `relax` applies near free surfaces, too, compared with the density below a plane one.
         elastic: whether the stress is a function of F alone, so that the body can be computed on the grid of its state
             at rest (docs/theory.md, 2.6).
         sensitivity: growth of the logarithm of the largest stiffness per stored strain, dimensionless. It sets how
@@ -107,6 +108,7 @@ class Law(ABC):
     coherent: ClassVar[bool] = False
     flows: ClassVar[bool] = False
     shifts: ClassVar[bool] = False
+    opens_at_surfaces: ClassVar[bool] = False
     elastic: ClassVar[bool] = False
     stiffness_parameters: ClassVar[tuple[str, ...]] = ("bulk_modulus", "youngs_modulus", "shear_modulus")
     viscosity_parameters: ClassVar[tuple[str, ...]] = ("viscosity", "consistency", "bulk_viscosity")
@@ -250,9 +252,11 @@ class Law(ABC):
 
         Args:
             deformation, internal, constants: as for `respond`.
-            seen: volume ratio from the density of the grid around the particle. opens: 1 if the volume may grow; 0 near
-                a free surface, where the density of the grid is too small. time: time since the last relaxation over
-                the cell's width, s/m; times the speed of sound it is the number of cells that sound has crossed.
+            seen: volume ratio from the density of the grid around the particle. opens: fraction of `seen` to which the
+                volume may grow. It is 1, and 0 near a free surface, where the density of the grid is too small; with
+                `opens_at_surfaces` it is the filled fraction of dense material there. time: time since the last
+                relaxation over the cell's width, s/m; times the speed of sound it is the number of cells that sound
+                has crossed.
         """
         raise NotImplementedError
 

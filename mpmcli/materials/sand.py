@@ -31,7 +31,8 @@ MU, LAMBDA, TIP, SLOPE, CORRECTION, SOUND_SPEED = range(6)
 REAL_MODULUS = 5e7
 # Upper bound on the plastic volume strain, ln J. It caps dilation, so that loose grains can recompact.
 SCATTERED = 2.0
-# Difference from the volume strain on the grid that is ignored, because the density varies by as much between grains.
+# Difference from the volume strain on the grid within which sand stays open, because the density varies by as much
+# between grains. Opening has no such band: the slope of the filling, which varies as well, hides as much.
 BAND = 0.025
 # Fraction of the rest by which sand under pressure opens while sound crosses a cell. With a tenth, as for fluids,
 # scattered sand stays up to 3 % too voluminous.
@@ -155,6 +156,7 @@ class Sand(HenckyLaw):
     projects = True
     flows = True
     shifts = True
+    opens_at_surfaces = True
 
     def __init__(self, members: tuple[SandParameters, ...], dimension: int) -> None:
         super().__init__(members, dimension)
@@ -214,7 +216,7 @@ class Sand(HenckyLaw):
         time: float,
         constants: ti.template(),
     ):
-        """Move v so that J = det F exp(v) approaches `seen`; v stays between 0 and SCATTERED."""
+        """Move v so that J = det F exp(v) lies from `opens` * `seen` to `seen`; v stays between 0 and SCATTERED."""
         v = internal
         if constants[CORRECTION] > 0.0:
             J = deformation.determinant()
@@ -223,9 +225,10 @@ class Sand(HenckyLaw):
             if J < 1.0:
                 crossings = constants[SOUND_SPEED] * time
                 share = RELAXATION * crossings / (1.0 + RELAXATION * crossings)
-            opening = ti.max(ti.min(strain - volume, strain) - BAND, 0.0)
+            apart = strain + log(opens)
+            opening = ti.max(ti.min(apart - volume, apart), 0.0)
             closing = ti.min(strain - volume + BAND, 0.0)
-            v[0] = ti.min(ti.max(v[0] + opens * share * opening + closing, 0.0), SCATTERED)
+            v[0] = ti.min(ti.max(v[0] + share * opening + closing, 0.0), SCATTERED)
         # A lower pressure does not increase the stiffness.
         return deformation, v, 0.0
 

@@ -11,6 +11,7 @@ The volumes of liquids and grains relax towards the density on the grid (docs/th
 only for laws with `Law.relaxes` and runs in one step of every `INTERVAL`.
 """
 
+import math
 from collections.abc import Sequence
 
 from mpmcli.materials.elementary import exp, exp_minus_1, log
@@ -255,13 +256,18 @@ def relax_volume(group: ti.template(), grid: ti.template(), last: ti.template(),
         scale = 1.0
     for _ in ti.static(range(grid.dimension)):
         scale *= grid.inverse_spacing
-    held, least = held_around(x, grid, last)
-    change = 0.0
-    if least * scale > FULL:
-        seen = 1.0 / (held * scale)
-        opens = 0.0
-        if seen > volume_ratio(group, group.stored(p)):
+    filled, opens, relaxes, change = 0.0, 0.0, True, 0.0
+    if ti.static(group.law.opens_at_surfaces):
+        filled, slope = filling_around(x, grid, last, scale)
+        opens = filling_below_surface(slope, grid.scheme.spline)
+    else:
+        held, least = held_around(x, grid, last)
+        filled = held * scale
+        relaxes = least * scale > FULL
+        if relaxes and 1.0 / filled > volume_ratio(group, group.stored(p)):
             opens = ti.select(held_beside(x, grid, last) > BESIDE * held, 1.0, 0.0)
+    if relaxes:
+        seen = 1.0 / filled
         deformation, inner, change = group.law.relax(
             group.stored(p), group.inner(p), seen, opens, time * grid.inverse_spacing, group.constants(p)
         )
@@ -302,7 +308,7 @@ def held_around(x: ti.template(), grid: ti.template(), last: ti.template()):
                 for k in ti.static(range(grid.scheme.spline.nodes)):
                     if place == k:
                         weight *= w[k, a]
-            held = mirrored_sum(node, grid, last, reach)
+            held = image_sum(node, grid, last, reach, True)
             mean += held * weight
             least = ti.min(least, held)
     else:
@@ -330,6 +336,47 @@ def held_around(x: ti.template(), grid: ti.template(), last: ti.template()):
                 smallest = ti.min(smallest, held)
         mean, least = total[d], smallest[d]
     return mean, least
+
+
+@ti.func
+def filling_around(x: ti.template(), grid: ti.template(), last: ti.template(), scale: float):
+    """Return the filled fraction of the grid at a point, and its gradient per cell; what is behind walls is full."""
+    d, nodes = ti.static(grid.dimension, grid.scheme.spline.nodes)
+    base, distance = grid.scheme.spline.stencil(x, grid.inverse_spacing)
+    w = grid.scheme.spline.weights(distance)
+    filled, moment = 0.0, ti.Vector.zero(float, d)
+    for q in range(ti.static(nodes**d)):
+        node, weight, way, free = base, 1.0, -distance, 1.0
+        for a in ti.static(range(d)):
+            place = q // ti.static(nodes ** (d - 1 - a)) % ti.static(nodes)
+            node[a] += place
+            way[a] += ti.cast(place, float)
+            for k in ti.static(range(nodes)):
+                if place == k:
+                    weight *= w[k, a]
+            if ti.static(a not in grid.period.axes and (a, 0) not in grid.opens):
+                free *= grid.scheme.spline.share_below(ti.cast(node[a] - PAD, float))
+            if ti.static(a not in grid.period.axes and (a, 1) not in grid.opens):
+                free *= grid.scheme.spline.share_below(ti.cast(last[a] - node[a], float))
+        part = weight * (image_sum(node, grid, last, ti.static(nodes - 2), False) * scale + 1.0 - free)
+        filled += part
+        moment += part * way
+    return filled, moment.norm() * ti.static(grid.scheme.spline.inverse_moment)
+
+
+@ti.func
+def filling_below_surface(slope: float, spline: ti.template()):
+    """Return the filled fraction of the grid at a point of dense material with a plane surface from its slope per cell.
+
+    Both are functions of the depth: the normal distribution function of variance 2 D, D that of the spline, and the
+    normal density of variance 2 D - 1/30 (docs/theory.md, 5.11).
+    """
+    variance = ti.static(2.0 / spline.inverse_moment)
+    narrow = ti.static(variance - 1.0 / 30.0)
+    share = ti.min(ti.max(slope * ti.static(math.sqrt(2.0 * math.pi * narrow)), 1e-6), 1.0)
+    z = ti.sqrt(-2.0 * log(share) * ti.static(narrow / variance))
+    # The distribution function to 2e-4.
+    return 1.0 / (1.0 + exp(-z * (1.5976 + 0.07056 * z * z)))
 
 
 @ti.func
@@ -374,8 +421,10 @@ def held_beside(x: ti.template(), grid: ti.template(), last: ti.template()):
 
 
 @ti.func
-def mirrored_sum(node: ti.template(), grid: ti.template(), last: ti.template(), reach: ti.template()):
-    """Return the sum of the mass or volume of a node and of its images beyond walls and periodic faces.
+def image_sum(
+    node: ti.template(), grid: ti.template(), last: ti.template(), reach: ti.template(), mirrors: ti.template()
+):
+    """Return the sum of the mass or volume of a node and its images beyond periodic faces and, with `mirrors`, walls.
 
     A node on a wall, whose cell is half outside, counts twice, at an edge or corner of walls 4 or 8 times. All walls
     have images here, whatever their condition. `reach` is the number of nodes inside a wall that have images.
@@ -386,7 +435,9 @@ def mirrored_sum(node: ti.template(), grid: ti.template(), last: ti.template(), 
         place, exists = node, True
         for a in ti.static(range(d)):
             if images >> a & 1 == 1:
-                image, found = image_along(node[a], a, grid, last, reach, 1)
+                image, found = node[a], False
+                if ti.static(mirrors or a in grid.period.axes):
+                    image, found = image_along(node[a], a, grid, last, reach, 1)
                 place[a] = image
                 exists = exists and found
         if exists:
