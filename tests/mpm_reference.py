@@ -121,17 +121,22 @@ def update_both(
     A node and its images in the faces that act on it share their momenta, the images' mirrored; on the
     plane of an acting face there is no normal velocity, and none at all where it sticks; the images get
     the velocity back, mirrored. A separating face acts where the material on its plane moves towards it,
-    the images of that plane in the faces that never let go included.
+    the images of that plane in the faces that never let go included. It leaves alone what has yet to reach it.
     """
     d = len(box.cells)
     g = kick * box.gravity
     raw_momentum, raw_mass = momentum, mass
     velocity, velocity_before = np.zeros_like(momentum), np.zeros_like(momentum)
 
-    def acting(node: tuple[int, ...]) -> list[tuple[int, int, int]]:
-        """Return (axis, side, depth) of the faces that act on a node."""
+    def reached(plane: list[int], axis: int, side: int) -> bool:
+        mass = [raw_mass[tuple(i + MARGIN + k * (a == axis) for a, i in enumerate(plane))] for k in (-1, 0, 1)]
+        beyond, on, inside = mass if side == 0 else mass[::-1]
+        return 2 * on >= 0.75 * inside or beyond >= 0.02 * on
+
+    def acting(node: tuple[int, ...]) -> tuple[list[tuple[int, int, int]], list[int]]:
+        """Return (axis, side, depth) of the faces that act on a node, and the axes whose faces it has yet to reach."""
         inner = [abs(i) if i <= MARGIN else (n - abs(n - i)) for i, n in zip(node, box.cells, strict=True)]
-        found = []
+        found, away = [], []
         for a, n in enumerate(box.cells):
             for side, depth in ((0, node[a]), (1, n - node[a])):
                 if depth > MARGIN or box.faces[a][side] == "open":
@@ -139,11 +144,14 @@ def update_both(
                 if box.faces[a][side] == "separate":
                     plane = list(inner)
                     plane[a] = n * side
+                    if not reached(plane, a, side):
+                        away.append(a)
+                        continue
                     out = separating_momentum(plane, a) * (1 if side else -1)
                     if out < 0:
                         continue
                 found.append((a, side, depth))
-        return found
+        return found, away
 
     def separating_momentum(plane: list[int], axis: int) -> float:
         total = 0.0
@@ -172,7 +180,7 @@ def update_both(
         return mirror
 
     for node in product(*(range(-MARGIN, n + 1 + MARGIN) for n in box.cells)):
-        faces = acting(node)
+        faces, away = acting(node)
         if any(depth < 0 for _, _, depth in faces):
             continue
         mirrors = [f for f in faces if f[2] > 0]
@@ -194,7 +202,7 @@ def update_both(
             if depth == 0:
                 v, u = (np.where(sign(axis, side) < 0, 0.0, w) for w in (v, u))
         for a, n in enumerate(box.cells):
-            held = {axis for axis, _, _ in faces}
+            held = {axis for axis, _, _ in faces} | set(away)
             if a not in held and node[a] <= 0 and box.faces[a][0] != "open":
                 v[a] = max(v[a], 0.0)
             if a not in held and node[a] >= n and box.faces[a][1] != "open":

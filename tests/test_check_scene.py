@@ -121,7 +121,7 @@ def test_a_dense_body_packs_snow_harder() -> None:
 @pytest.mark.parametrize("speed", [1.0, 4.0])
 @pytest.mark.parametrize("shape", [{"ball": {"center": [0.5, 0.3], "radius": 0.127}}, box([0.38, 0.05], [0.62, 0.29])])
 def test_snow_that_hits_the_floor_keeps_the_step_that_is_safe(backend_of: Callable, shape: dict, speed: float) -> None:
-    """Its smallest step is that one, within the safety factor, and at most twice as long.
+    """It is the smallest step, within the safety factor, and at most 2.2 times as long (a block that lands flat).
 
     Of eight balls of about this size and place, two take a step of half to two thirds of it for a moment.
     """
@@ -135,7 +135,7 @@ def test_snow_that_hits_the_floor_keeps_the_step_that_is_safe(backend_of: Callab
         solver=F64,
     )
     steps = [row.step_min for _, row in build_run(scene.scene, backend_of("f64", 1)).frames()]
-    assert 0.8 < min(steps[1:]) / SceneFacts(scene.scene).step < 2
+    assert 0.8 < min(steps[1:]) / SceneFacts(scene.scene).step < 2.2
 
 
 @pytest.mark.parametrize(

@@ -230,8 +230,7 @@ class ColliderPoints:
                 for face in range(self.colliders.faces_of(i)):
                     phi, normal = self.colliders.distance(i, arm, face)
                     if ti.abs(phi) <= HALF * h and self.colliders.acts_by_points(i, arm, face, phi, normal):
-                        y = x - phi * normal
-                        part = self.part_inside(walls, extent, y)
+                        y, part = self.place_inside(walls, extent, node, x - phi * normal, normal)
                         if part > 0.0:
                             if first >= 0:
                                 self.write_point(first + found, own, k, y, normal, part)
@@ -247,19 +246,32 @@ class ColliderPoints:
             self.centre[p][a], self.normal[p][a] = y[a], normal[a]
 
     @ti.func
-    def part_inside(self, walls: ti.template(), extent: ti.template(), y: ti.template()):
-        """Return the share of a point that belongs to the domain: 1, 0, or a half on a wall."""
-        part, tiny = 1.0, 1e-5 * self.colliders.spacing
+    def place_inside(
+        self,
+        walls: ti.template(),
+        extent: ti.template(),
+        node: ti.template(),
+        y: ti.template(),
+        normal: ti.template(),
+    ):
+        """Return the place of point y of a node, and its share inside the domain: 1, 0, or a half for nodes on a wall.
+
+        If the point of a node on a wall lies beyond the wall, it is moved along the surface to the wall.
+        """
+        place, part, tiny = y, 1.0, 1e-5 * self.colliders.spacing
         for a in ti.static(range(self.dimension)):
             if ti.static(a in walls.periodic):
                 if y[a] < -tiny or y[a] >= extent[a] - tiny:
                     part = 0.0
-            else:
-                if y[a] < -tiny or y[a] > extent[a] + tiny:
-                    part = 0.0
-                elif y[a] < tiny or y[a] > extent[a] - tiny:
-                    part *= 0.5
-        return part
+            elif node[a] == walls.first or node[a] == walls.last[a]:
+                part *= 0.5
+                back = ti.min(ti.max(y[a], 0.0), extent[a]) - y[a]
+                along = ti.max(1.0 - normal[a] ** 2, 0.5)
+                for c in ti.static(range(self.dimension)):
+                    place[c] += ti.select(c == a, 1.0, -normal[a] * normal[c] / along) * back
+            elif y[a] < -tiny or y[a] > extent[a] + tiny:
+                part = 0.0
+        return place, part
 
     @ti.func
     def weight(self, along: ti.template(), c: int):
