@@ -98,7 +98,7 @@ def test_sand_stays_on_a_gentle_slope_and_flows_on_a_steep_one(
     record_property("shear stress / pressure", str(np.round(ratios, 4).tolist()))
     record_property("sin(phi)", float(strength))
     if stays:
-        assert abs(slips[-1]) < (0.02 if strength < np.tan(np.radians(SLOPE)) else 1e-4)
+        assert abs(slips[-1]) < (0.02 if strength < np.tan(np.radians(SLOPE)) else 2e-4)
         assert np.abs(speeds[-4:]).max() < 1e-3
     else:
         assert slips[-1] > 0.3
