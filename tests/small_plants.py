@@ -204,7 +204,7 @@ PLASTIC = (
         ("deviator *= strength", "deviator *= 1.05 * strength", "sand_shear"),
         ("spherical = constants[LAMBDA]", "spherical = 1.05 * constants[LAMBDA]", "sand_shear"),
         ("log(J), log(seen)", "log(J), log(1.05 * seen)", "sand_toss"),
-        ("opens * share * opening", "0.0 * share * opening", "sand_toss"),
+        ("v[0] + share * opening", "v[0] + 0.0 * share * opening", "sand_toss"),
     ),
     *_of(
         "materials/snow.py",
