@@ -332,7 +332,10 @@ def test_resting_fluid_stays_on_a_separating_floor(backend_of: Callable, record_
     "material",
     [
         {"law": "fluid", "density": 1000.0, "bulk_modulus": 8e5},
-        {"law": "sand", "density": 1600.0, "youngs_modulus": 6e5, "poissons_ratio": 0.3, "friction_angle": 35.0},
+        pytest.param(
+            {"law": "sand", "density": 1600.0, "youngs_modulus": 6e5, "poissons_ratio": 0.3, "friction_angle": 35.0},
+            marks=pytest.mark.slow,
+        ),
     ],
     ids=["water", "sand"],
 )
