@@ -266,6 +266,7 @@ class ColliderPoints:
             elif node[a] == walls.first or node[a] == walls.last[a]:
                 part *= 0.5
                 back = ti.min(ti.max(y[a], 0.0), extent[a]) - y[a]
+                # The point of a surface that is nearly parallel to the wall is not moved as far as that.
                 along = ti.max(1.0 - normal[a] ** 2, 0.5)
                 for c in ti.static(range(self.dimension)):
                     place[c] += ti.select(c == a, 1.0, -normal[a] * normal[c] / along) * back
