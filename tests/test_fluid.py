@@ -7,7 +7,7 @@ import pytest
 from law_probe import Probes
 from law_tangent import largest_stiffness, largest_viscosity
 
-from mpmcli.materials.fluid import CRUSHED, Fluid, FluidParameters
+from mpmcli.materials.fluid import ATMOSPHERE, CRUSHED, TEARS, Fluid, FluidParameters
 from mpmcli.materials.law import StateBound
 from mpmcli.scene.material import SceneBounds
 
@@ -101,11 +101,11 @@ def test_viscous_stress_is_newtonian(probes: Probes, d: int) -> None:
 
 @pytest.mark.parametrize("d", [2, 3])
 def test_tension_cutoff(probes: Probes, d: int) -> None:
-    """J > 1: no stress and no energy; J is kept, and falls back to 1 at once without volume correction.
+    """J > 1, torn: no stress and no energy; J is kept, and falls back to 1 at once without volume correction.
 
     Without the cut-off there is suction K (J - 1), and J is kept.
     """
-    J = np.array([1 + 1e-3, 1.5, 27.0])
+    J = np.array([1 + 2.1 * TEARS, 1.5, 27.0])
     for correction, kept in ((True, J), (False, np.ones(3))):
         cut = probes(d, volume_correction=correction)(swollen(J, d))
         assert not cut.tau.any()
@@ -179,22 +179,41 @@ def test_viscous_modes(probes: Probes, d: int) -> None:
     assert ours == pytest.approx(d * K / rho * (dt / h) ** 2 + 4 * (mu / rho) * dt / h**2)
 
 
+@pytest.mark.parametrize("modulus", [K, 2e9])
+def test_suction_until_the_fluid_tears(probes: Probes, modulus: float) -> None:
+    """K (J - 1) up to a strength, then falling as steeply: that at J - 1 = 0.005, at most one atmosphere."""
+    strength = min(TEARS * modulus, ATMOSPHERE)
+    strain = np.linspace(0.0, 3.0, 40) * strength / modulus
+    J = (1 + strain).astype(probes.real).astype(float)
+    tau = spherical(probes(2, bulk_modulus=modulus)(swollen(J, 2)).tau)
+    assert np.abs(tau - torn(J - 1, modulus)).max() < 8 * probes.epsilon * modulus
+    assert tau.max() == pytest.approx(strength, rel=0.1)
+    assert not tau[strain > 2.1 * strength / modulus].any()
+
+
+def torn(strain: np.ndarray, modulus: float) -> np.ndarray:
+    """Return the suction, Pa, of a fluid without viscosity whose J - 1 is `strain`."""
+    strength = min(TEARS * modulus, ATMOSPHERE)
+    return np.interp(strain, np.array([0.0, 1.0, 2.0]) * strength / modulus, [0.0, strength, 0.0])
+
+
 @pytest.mark.parametrize("d", [2, 3])
-def test_suction_is_bounded_by_viscosity(probes: Probes, d: int) -> None:
-    """tau = min(K (J - 1), 3 mu sqrt(2 D':D')) I + 2 mu D', D' in 3D: none at rest, and none without viscosity."""
+def test_suction_that_viscosity_adds(probes: Probes, d: int) -> None:
+    """tau = min(K (J - 1), max(suction, 3 mu sqrt(2 D':D'))) I + 2 mu D', D' in 3D, and its suction alone at rest."""
     rng = np.random.default_rng(4)
-    J, mu = np.linspace(1.0, 1.002, 40), 5.0
+    J, mu = np.linspace(1.0, 1.02, 40), 5.0
     C = rng.normal(0, 20.0, (len(J), d, d)) * (np.arange(len(J)) > 4)[:, None, None]
     D = np.zeros((len(J), 3, 3))
     D[:, :d, :d] = (C + C.transpose(0, 2, 1)) / 2
     D -= np.trace(D, axis1=1, axis2=2)[:, None, None] / 3 * np.eye(3)
     bound = 3 * mu * np.sqrt(2 * (D**2).sum((1, 2)))
-    assert (bound < K * (J - 1)).any() and (bound > K * (J - 1))[5:].any()
+    bound = np.maximum(bound, torn(J - 1, K))
+    assert (bound < K * (J - 1)).any() and (bound > torn(J - 1, K))[5:].any()
     expected = np.minimum(K * (J - 1), bound)[:, None, None] * np.eye(3) + 2 * mu * D
     found = probes(d, viscosity=mu)(swollen(J, d), C=C).tau
     # J - 1 is rounded against 1.
     assert np.abs(found - expected).max() < 8 * probes.epsilon * K
-    assert not probes(d)(swollen(J, d), C=C).tau.any()
+    assert np.abs(spherical(probes(d)(swollen(J, d), C=C).tau) - torn(J - 1, K)).max() < 8 * probes.epsilon * K
 
 
 def test_what_is_not_asked_for_is_not_compiled() -> None:

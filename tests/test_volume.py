@@ -110,10 +110,8 @@ def filling(x: np.ndarray, volume: np.ndarray, cells: tuple[int, ...]) -> tuple[
 
 
 def grown(J: np.ndarray, C: np.ndarray, dt: float) -> np.ndarray:
-    """Return J det(I + dt C), opened to OPENED at most, and begun at 1 where it closes after less than SLACK."""
-    factor = np.linalg.det(np.eye(C.shape[-1]) + dt * C)
-    begun = np.where((factor < 1) & (J > 1) & (J < 1 + SLACK), 1.0, J)
-    return np.minimum(begun * factor, np.maximum(J, OPENED))
+    """Return J det(I + dt C), opened to OPENED at most."""
+    return np.minimum(J * np.linalg.det(np.eye(C.shape[-1]) + dt * C), np.maximum(J, OPENED))
 
 
 def test_openings_are_remembered(backend_of: Callable) -> None:
@@ -131,7 +129,7 @@ def test_openings_are_remembered(backend_of: Callable) -> None:
     ]
     run = build_run(unshifted(scene([13, 5], H, bodies, 1.0, precision="f64")), backend_of("f64"))
     (group,) = run.groups
-    before = np.random.default_rng(5).choice([0.99, 1 + 0.6 * SLACK, 1 + 2 * SLACK, 1.5, 1.999, 3.0], group.count)
+    before = np.random.default_rng(5).choice([0.99, 1.003, 1.01, 1.5, 1.999, 3.0], group.count)
     for sign in (1, -1):
         moving = group.read()
         group.replace(v=sign * moving["v"], C=sign * moving["C"], deformation=before)
@@ -143,7 +141,8 @@ def test_openings_are_remembered(backend_of: Callable) -> None:
         assert J[body == 0] == pytest.approx(grown(before, C, dt)[body == 0], rel=1e-14)
         assert J[body == 1] == pytest.approx(free[body == 1], rel=1e-14)
         assert J[body == 2] == pytest.approx((free * np.minimum(1 / before, 1))[body == 2], rel=1e-14)
-        assert (np.abs(grown(before, C, dt) - free)[body == 0] > 1e-5).any()
+        # What opens does so up to OPENED.
+        assert (np.abs(grown(before, C, dt) - free)[body == 0] > 1e-5).any() == (sign < 0)
 
 
 @pytest.mark.parametrize(
@@ -157,7 +156,8 @@ def test_openings_are_remembered(backend_of: Callable) -> None:
 def test_volume_follows_the_grid(backend_of: Callable, densities: tuple[float, ...], walls: object, d: int) -> None:
     """J += share sgn(g) max(|g| - band, 0), g = 1/sum(w n) - J, where all n > FULL; share = a/(1 + a), a = rate c t/h.
 
-    Down to J = 1 all of |g| - SLACK instead. It grows only where the nodes beside the stencil are filled, too.
+    Down to J = 1 all of g - DEAD_BAND or g + SLACK instead. It grows only where the nodes beside the stencil are
+    filled, too.
 
     The same step without relaxation differs by that alone: positions, velocities and gradients have the same bytes.
     """
@@ -184,7 +184,8 @@ def test_volume_follows_the_grid(backend_of: Callable, densities: tuple[float, .
     J = before["deformation"]
     moves = (least > FULL) & ((seen < J) | (beside * seen > BESIDE))
     gap = (seen - J) * moves
-    free = np.where(J >= 1, np.maximum(J + np.sign(gap) * np.maximum(np.abs(gap) - SLACK, 0), 1), J)
+    free = np.maximum(J + np.maximum(gap - DEAD_BAND, 0) + np.minimum(gap + SLACK, 0), 1)
+    free = np.where(J >= 1, free, J)
     gap = np.maximum(seen - free, np.minimum(1 - free, 0) - LARGEST_LACK) * moves
     gap = np.where(gap > 0, np.clip(seen - 1, 0, gap), gap)
     share = RELAXATION * crossings / (1 + RELAXATION * crossings)
@@ -194,11 +195,8 @@ def test_volume_follows_the_grid(backend_of: Callable, densities: tuple[float, .
     if len(densities) == 1:
         # Of two layers one keeps a share of its C, which is not the one by which volumes grow.
         assert plain["deformation"] == pytest.approx(grown(J, plain["C"], 1e-4), abs=1e-13)
-    # All but what closes from just above 1, which begins there, grows by the same factor.
-    grow = np.all([(volumes <= 1) | (volumes >= 1 + SLACK) for volumes in (J, expected)], axis=0)
-    assert grow.mean() > 0.8
     factor = plain["deformation"] / J
-    assert relaxed["deformation"][grow] == pytest.approx((expected * factor)[grow], rel=1e-12)
+    assert relaxed["deformation"] == pytest.approx(expected * factor, rel=1e-12)
     for name in ("x", "v", "C"):
         assert relaxed[name].tobytes() == plain[name].tobytes()
 

@@ -26,9 +26,12 @@ BESIDE = 0.4
 DEAD_BAND = 0.02
 # Largest lack of volume that causes pressure, so that coincident particles do not explode.
 LARGEST_LACK = 0.1
-# Difference that is ignored without pressure, and opening that is forgotten when it ends. A released column opens by a
-# tenth of it at its turning points; closing without pressure would lengthen its period.
+# Difference that is ignored without pressure.
 SLACK = 0.005
+# Suction that a fluid bears before it tears: that of this opening, and at most one atmosphere, where liquids boil. It
+# draws a stream together while gravity stretches it. With a fifth of it a column that is drawn out at once tears;
+# four times as much changes nothing.
+TEARS, ATMOSPHERE = 0.005, 101325.0
 # J up to which deformation opens; beyond it J follows the grid alone.
 OPENED = 2.0
 # Speed that "auto" assumes if nothing in the scene moves or falls, m/s.
@@ -89,8 +92,8 @@ class FluidParameters(WeaklyCompressibleParameters):
     )
     tension_cutoff: Flag = Field(
         True,
-        description="Whether the fluid takes no tension: below the density at rest its pressure is 0. "
-        "False holds droplets together by suction.",
+        description="Whether the fluid tears: it bears suction only until J is 1.005, and none without "
+        "`volume_correction`. False holds droplets together by suction.",
     )
     volume_correction: Flag = Field(
         True,
@@ -147,12 +150,12 @@ def soft_bulk_modulus(density: float, compressibility: float, bounds: SceneBound
 def relaxed_volume(J: float, seen: float, crossings: float, rate: float, opens: float):
     """Return J after relaxation towards `seen`, the value on the grid, and the part of its change that causes pressure.
 
-    Above 1, where there is no pressure, J follows at once (docs/theory.md, 5.11); below, by the share `rate` while
+    Above 1 J follows at once (docs/theory.md, 5.11); below, by the share `rate` while
     sound crosses a cell. Where `opens` is 0 the volume may not grow.
     """
     free = J
     if J >= 1.0:
-        free = ti.max(J + opens * ti.max(seen - J - SLACK, 0.0) + ti.min(seen - J + SLACK, 0.0), 1.0)
+        free = ti.max(J + opens * ti.max(seen - J - DEAD_BAND, 0.0) + ti.min(seen - J + SLACK, 0.0), 1.0)
     gap = ti.max(seen, ti.min(free, 1.0) - LARGEST_LACK) - free
     # At the density at rest there is no space to open: evenly spaced particles may bear pressure.
     room = ti.max(ti.min(gap, seen - 1.0) - DEAD_BAND, 0.0)
@@ -171,15 +174,19 @@ def shear_rate(C: ti.template()):
 
 
 @ti.func
+def largest_suction(bulk_modulus: float, opening: float):
+    """Return the suction, Pa, that a fluid with J - 1 = opening bears: it rises until the fluid tears, and then falls."""
+    strength = ti.min(TEARS * bulk_modulus, ATMOSPHERE)
+    return ti.max(ti.min(bulk_modulus * opening, 2.0 * strength - bulk_modulus * opening), 0.0)
+
+
+@ti.func
 def opened_volume(J_minus_1: float, growth: float):
     """Return J - 1 after J grew by the factor 1 + growth, for material that stores its opening."""
     opened = J_minus_1 + (growth + growth * J_minus_1)
     # Comparisons with NaN are false, so that a lost particle stays not finite.
     if opened > OPENED - 1.0 and opened > J_minus_1:
         opened = ti.max(J_minus_1, OPENED - 1.0)
-    # After such a small opening, closing begins at J = 1.
-    if growth < 0.0 and J_minus_1 > 0.0 and J_minus_1 < SLACK:
-        opened = growth
     return opened
 
 
@@ -188,8 +195,8 @@ class Fluid(Law):
     """p = K/g (J^-g - 1) and tau = -J p I + viscosity (C + C^T - (2/3) tr C I) + bulk_viscosity tr C I.
 
     With tension_cutoff, fluid that expands in a splash, J > 1, has no pressure. With volume_correction J stays there
-    and follows the density of the grid, and p >= -3 viscosity sqrt(2 D':D'), D' the deviator of the rate of strain in
-    3D; without it J falls back to 1. Source: docs/theory.md, 5.2 and 5.11.
+    and follows the density of the grid, and up to J = 1.01, and up to the viscous stress, there is suction; without it J
+    falls back to 1. Source: docs/theory.md, 5.2 and 5.11.
     """
 
     name = "fluid"
@@ -280,9 +287,9 @@ class Fluid(Law):
             excess = -exp_minus_1(-constants[EXPONENT] * log(crushed))
             spherical = constants[BULK_MODULUS] * crushed * excess / constants[EXPONENT]
         if ti.static(self.relaxes):
-            suction = 0.0
+            suction = largest_suction(constants[BULK_MODULUS], J - 1.0)
             if ti.static(self.viscous):
-                suction = SUCTION * constants[VISCOSITY] * shear_rate(C)
+                suction = ti.max(suction, SUCTION * constants[VISCOSITY] * shear_rate(C))
             if ti.static(self.all_relax):
                 spherical = ti.min(spherical, suction)
             elif constants[SOUND_SPEED] > 0.0:
