@@ -138,8 +138,10 @@ def test_only_nan_still_has_limits(tmp_path: Path) -> None:
     nothing = write(tmp_path / "nan", facts, [frame(0, PLACES, pressure=np.full(N, np.nan))])
     colors = color_by("pressure", nothing, render_scene_of(nothing), LIGHT)
     assert colors.limits[0] < colors.limits[1]
-    empty = write(tmp_path / "empty", facts, [frame(0, np.empty((0, 2)), stress=np.empty((0, 2, 2)))])
-    for name in ("speed", "stress", "id"):
+    empty = write(
+        tmp_path / "empty", facts, [frame(0, np.empty((0, 2)), stress=np.empty((0, 2, 2)), volume_ratio=np.empty(0))]
+    )
+    for name in ("speed", "stress", "stress.xy", "volume_ratio", "id"):
         assert color_by(name, empty, render_scene_of(empty), LIGHT).particle_rgb(empty.frame(0)).shape == (0, 3)
 
 

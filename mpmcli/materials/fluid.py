@@ -175,7 +175,7 @@ def shear_rate(C: ti.template()):
 
 @ti.func
 def largest_suction(bulk_modulus: float, opening: float):
-    """Return the suction, Pa, that a fluid with J - 1 = opening bears: it rises until the fluid tears, and then falls."""
+    """Return the suction, Pa, that a fluid with J - 1 = opening bears: it rises until it tears, and then falls."""
     strength = ti.min(TEARS * bulk_modulus, ATMOSPHERE)
     return ti.max(ti.min(bulk_modulus * opening, 2.0 * strength - bulk_modulus * opening), 0.0)
 
@@ -195,8 +195,8 @@ class Fluid(Law):
     """p = K/g (J^-g - 1) and tau = -J p I + viscosity (C + C^T - (2/3) tr C I) + bulk_viscosity tr C I.
 
     With tension_cutoff, fluid that expands in a splash, J > 1, has no pressure. With volume_correction J stays there
-    and follows the density of the grid, and up to J = 1.01, and up to the viscous stress, there is suction; without it J
-    falls back to 1. Source: docs/theory.md, 5.2 and 5.11.
+    and follows the density of the grid, and there is suction until J = 1.01, and up to the viscous stress; without it
+    J falls back to 1. Source: docs/theory.md, 5.2 and 5.11.
     """
 
     name = "fluid"

@@ -1,5 +1,6 @@
 """Colourings of particles: by a value with its unit and limits, or by category; `--color-by` selects one."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import get_args
@@ -151,7 +152,7 @@ def _field(name: str, result: Result) -> Coloring:
 
     def array(frame: Frame) -> np.ndarray:
         values = frame.velocity if field == "velocity" else frame.fields[field]
-        return np.asarray(values, dtype=np.float64).reshape(len(frame.position), -1)
+        return np.asarray(values, dtype=np.float64).reshape(len(frame.position), math.prod(values.shape[1:]))
 
     width = array(result.present_frame(0, fields)).shape[1]
     plain = field.replace("_", " ")
