@@ -31,6 +31,8 @@ REACH = 0.76
 DEEP, DEEP_STICKING = -0.76, -1.25
 # A surface acts at nodes all the same where the collider is thin: PROBE cells below it, its distance is above -WITHIN.
 PROBE, WITHIN = 0.75, 0.2
+# Depth in cells from which particles that drift in are moved out.
+SUNK = 0.2
 # Codes of the conditions of surfaces.
 SLIP, STICK, SEPARATE, HOLD = range(4)
 WALLS = {"slip": SLIP, "stick": STICK, "separate": SEPARATE, "hold": HOLD}
@@ -375,15 +377,19 @@ class Colliders:
         return near
 
     @ti.func
-    def held_back(self, x: ti.template(), way: ti.template()):
-        """Return the displacement `way`, m, of a particle at x, limited to half of the distance to any collider."""
+    def held_back(self, x: ti.template(), way: ti.template(), most: float):
+        """Return the displacement `way`, m, of a particle at x, limited to half of the distance to any collider.
+
+        A particle that has drifted in by more than SUNK cells is moved out, by at most `most`.
+        """
         result = way
         for k in range(self.count[self.run]):
             i = self.run * self.capacity + k
             if self.covers(i, x) and self.wall[i] != HOLD:
                 for face in range(self.faces_of(i)):
                     phi, normal = self.distance(i, x - self.place[i], face)
-                    result += ti.max(-0.5 * ti.max(phi, 0.0) - result.dot(normal), 0.0) * normal
+                    least = ti.max(-0.5 * ti.max(phi, 0.0), ti.min(-SUNK * self.spacing - phi, most))
+                    result += ti.max(least - result.dot(normal), 0.0) * normal
         return result
 
     @ti.func

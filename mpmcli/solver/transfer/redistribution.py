@@ -408,11 +408,12 @@ def mirrored(value: ti.template(), axis: ti.template(), grid: ti.template()):
 
 @ti.func
 def held_back(at: ti.template(), x: ti.template(), way: ti.template()):
-    """Return the displacement, m, limited to half the distance from x to a wall or a collider."""
+    """Return the displacement, m, limited to half the distance from x to a wall or a collider, or out of a collider."""
     (grid,) = ti.static((at.grid,))
     result = way
     if ti.static(at.nodes.collides):
-        result = at.nodes.colliders.held_back(x, way)
+        most = FARTHEST * at.grid.spacing * ti.static(1.0 / at.grid.fine.per_cell)
+        result = at.nodes.colliders.held_back(x, way, most)
     for a in ti.static(range(grid.dimension)):
         if ti.static(a not in grid.period.axes and (a, 0) not in grid.opens):
             result[a] = ti.max(result[a], -0.5 * x[a])
