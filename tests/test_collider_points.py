@@ -131,9 +131,11 @@ def test_a_vessel_with_thin_walls_holds_water(backend_of: Callable, offset: floa
 
     In its corners particles creep in, which nodes do not see; those deeper than 0.2 cells are moved out.
     """
-    low = np.array([6.0, 4.0]) + offset
-    high = low + [12.0, 20.0]
-    wall = {"box": {"min": list((low - 2) * H), "max": list((high + [2, 0]) * H)}}
+    low, high = np.array([6.0, 4.0]) + offset, np.array([18.0, 24.0]) + offset
+    outside, inside, water = (
+        {"box": {"min": list((low - thickness) * H), "max": [(high[0] + thickness) * H, top * H]}}
+        for thickness, top in ((2, high[1]), (0, high[1] + 1), (0, low[1] + 10))
+    )
     asked = scene_of(
         domain={"size": [24 * H, 28 * H], "spacing": H, "gravity": [0.0, -G], "walls": "open"},
         time={"end": 2.0, "frames": 20},
@@ -141,17 +143,12 @@ def test_a_vessel_with_thin_walls_holds_water(backend_of: Callable, offset: floa
             {
                 "name": "water",
                 "material": WATER,
-                "shape": {"box": {"min": list(low * H), "max": list((low + [12, 10]) * H)}},
+                "shape": water,
                 "velocity": [0.7, 0.0],
                 "sampling": "turned",
             }
         ],
-        colliders=[
-            {
-                "name": "vessel",
-                "shape": wall | {"subtract": [{"box": {"min": list(low * H), "max": list((high + [0, 1]) * H)}}]},
-            }
-        ],
+        colliders=[{"name": "vessel", "shape": outside | {"subtract": [inside]}}],
     )
     for frame, _ in build_run(asked, backend_of("f32", 1)).frames():
         x = frame.position / H
