@@ -280,13 +280,17 @@ shape = { box = { min = [0.4, 0.0], max = [0.6, 0.2] } }
 """
 
 
-def test_pressure_of_mud_at_rest_is_its_weight(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "changed", [(), ("bodies.mud.sampling=jittered",), ("time.safety=0.4",)], ids=["", "jittered", "half the step"]
+)
+def test_pressure_of_mud_at_rest_is_its_weight(tmp_path: Path, changed: tuple[str, ...]) -> None:
     """A block of mud that has spread bears its weight, to a few times its yield stress.
 
     With volumes of its own each particle keeps what flow leaves of noise: +-50 kPa, a root mean square of 9 kPa.
     """
     (tmp_path / "slump.toml").write_text(SLUMP, encoding="utf-8")
-    assert run_here("simulate", tmp_path / "slump.toml", "-o", tmp_path / "out", "--quiet").status == 0
+    options = [word for value in changed for word in ("--set", value)]
+    assert run_here("simulate", tmp_path / "slump.toml", "-o", tmp_path / "out", "--quiet", *options).status == 0
     frame = open_result(tmp_path / "out").frame(1)
     place, h = frame.position[:, :2].astype(float), 0.01
     column = np.floor(place[:, 0] / h).astype(int)
