@@ -66,10 +66,9 @@ def test_water_that_a_tide_draws_out_keeps_its_volume(backend: Backend, sampling
 
 
 def test_water_that_is_poured_thins_as_fast_as_it_falls(backend: Backend) -> None:
-    """Its width times its speed is the same at three heights, to 5 %.
+    """Its width times its speed is that at the mouth, 48 mm at 0.4 m/s, at three heights, to 5 %, and its J is 1.
 
-    At the mouth, 48 mm at v = 0.4 m/s, no water above holds it: over the width of the kernel it falls freely, and is
-    less dense by up to 3/2 h g / v^2.
+    If it began at the mouth, it would fall freely there over the width of the kernel: 1.4 times as wide.
     """
     mouth = {"box": {"min": [0.036, 0.188], "max": [0.084, 0.212]}}
     tap = {"name": "tap", "material": WATER, "shape": mouth, "velocity": [0.0, -0.4]}
@@ -81,22 +80,21 @@ def test_water_that_is_poured_thins_as_fast_as_it_falls(backend: Backend) -> Non
             x, v = frame.position[stream].astype(float), frame.velocity[stream].astype(float)
             near = [np.abs(x[:, 1] - height) < 1.5 * SPACING for height in heights]
             found.append([np.sqrt(12 * x[own, 0].var()) * -v[own, 1].mean() for own in near])
-    flow = np.mean(found, axis=0)
-    assert np.abs(flow / flow.mean() - 1).max() < 0.05
-    assert 1.0 < flow.mean() / (0.048 * 0.4) < 1.0 + 1.5 * SPACING * 9.81 / 0.4**2
+            assert frame.fields["volume_ratio"][stream].mean() == pytest.approx(1.0, abs=0.01)
+    assert np.mean(found, axis=0) == pytest.approx(0.048 * 0.4, rel=0.05)
 
 
 def test_honey_thins_as_fast_as_it_falls(backend: Backend) -> None:
     """Its width times its speed is the same at four heights, to 5 %, and its volume that at rest, to 2 %.
 
-    A mouth of 24 mm, 0.2 m/s, from which it falls 15 cm.
+    A mouth of 24 mm, 0.2 m/s, from which it falls 15 cm, later than by itself, because it hangs on what follows.
     """
     mouth = {"box": {"min": [0.048, 0.188], "max": [0.072, 0.212]}}
     spoon = {"name": "spoon", "material": HONEY, "shape": mouth, "velocity": [0.0, -0.2]}
-    scene = poured(HONEY, {"box": {"min": [0.0, 0.0], "max": [0.012, 0.012]}}, emitters=[spoon])
-    heights, found, ratios = np.array([0.17, 0.14, 0.11, 0.08]), [], []
+    scene = poured(HONEY, {"box": {"min": [0.0, 0.0], "max": [0.012, 0.012]}}, end=1.0, emitters=[spoon])
+    heights, found, ratios = np.array([0.16, 0.13, 0.1, 0.07]), [], []
     for frame, _ in build_run(scene, backend).frames():
-        if frame.time > 0.29:
+        if frame.time > 0.65:
             stream = (frame.fields["status"] == 1) & (frame.body == 1)
             x, v = frame.position[stream].astype(float), frame.velocity[stream].astype(float)
             near = [np.abs(x[:, 1] - height) < 1.5 * SPACING for height in heights]

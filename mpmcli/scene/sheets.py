@@ -1,5 +1,8 @@
 """The particles of an emitter, sheet after sheet: their positions, number and times of entry.
 
+Particles enter a nozzle before the mouth, in which they keep their velocity. The stream hangs on them: if it began at
+the mouth, it would fall freely over the width of the kernel, and be less dense.
+
 A layer has a particle for each cell of the lattice on the mouth. It enters as one sheet, or as several in succession: a
 slow stream stretched by gravity would tear between sheets that are a particle distance apart.
 """
@@ -24,6 +27,8 @@ _SLACK = 1e-9
 _INSTANTS = 2**15 + 1
 # Speed, m/s, and area below which nothing flows.
 _SLOWEST = _TINY = 1e-300
+# Length of the nozzle before a mouth, cells: the kernel at the mouth is full.
+_NOZZLE = 2.0
 # Sheets per layer, if a layer is divided.
 _PER_LAYER = 8
 # Golden and plastic number, the smallest real roots above 1 of z^2 = z + 1 and z^3 = z + 1.
@@ -62,7 +67,8 @@ class Sheets:
     per_layer: int  # sheets of a layer
     particles: int  # of all sheets
     period: float  # between two of them at the largest speed, s
-    due: np.ndarray  # when each is due, (count,), s
+    lead: float  # length of the nozzle: how far before the mouth particles enter, m
+    due: np.ndarray  # when each enters, (count,), s
     speeds: np.ndarray  # at which each enters, (count,), m/s
     volume: float  # of a particle at rest, m^3 (m^2 in 2D)
 
@@ -75,12 +81,17 @@ class Sheets:
         """Time from each sheet to the next one over `period`, (count,)."""
         return np.diff(self.due, append=self.due[-1:] + self.period) / self.period
 
+    @property
+    def early(self) -> float:
+        """How long before it passes the mouth a particle enters, s."""
+        return self.lead / float(self.speeds[0]) if self.lead and self.count else 0.0
+
     def velocities(self) -> np.ndarray:
         """Return the velocities at which all particles enter, (n, d), m/s."""
         return self.speeds[np.arange(self.particles) // self.size, None] * self.mouth.direction
 
     def places(self, emitter: Emitter) -> np.ndarray:
-        """Return the positions of entry of all particles, (n, d), m, in the order of entry.
+        """Return the positions of entry of all particles, (n, d), m, in the order of entry: `lead` before the mouth.
 
         The particles of a partial sheet lie in front of the mouth, as if each had entered at its own time since the
         previous sheet.
@@ -88,7 +99,7 @@ class Sheets:
         mouth, number = self.mouth, np.arange(self.particles)
         filled = np.argwhere(mouth.filled)
         if emitter.sampling == "lattice":
-            return mouth.place(filled[number % len(filled)] + 0.5)
+            return mouth.place(filled[number % len(filled)] + 0.5) - self.lead * mouth.direction
         if emitter.sampling == "jittered":
             layers = -(-self.particles // len(filled))
             random = np.random.default_rng(emitter.seed).random((layers, len(filled), len(mouth.centre)))
@@ -99,7 +110,7 @@ class Sheets:
         else:
             cells, due = _even_cells(mouth, emitter.shape, self.particles), (number + 0.5) / self.size
         ahead = (number // self.size + 1 - due) * (mouth.spacing[0] * self.size / max(1, len(filled)))
-        return mouth.place(cells) + ahead[:, None] * mouth.direction
+        return mouth.place(cells) + (ahead[:, None] - self.lead) * mouth.direction
 
 
 def _even_cells(mouth: Mouth, shape: Shape, count: int) -> np.ndarray:
@@ -206,13 +217,29 @@ def sheets_of(emitter: Emitter, scene: Scene) -> Sheets:
         totals.append(emitter.volume / volume)
     particles = step * max(1, round(min(totals) / step)) if totals[0] and layer else 0
     number = np.arange(-(-particles // max(1, size)))
-    due, speeds = emitter.start + number * period, np.full(len(number), speed)
+    lead = _lead(emitter, scene, mouth)
+    due, speeds = emitter.start - lead / max(speed, _SLOWEST) + number * period, np.full(len(number), speed)
     if varies(emitter.rate):
         times, flown = _flow(emitter, scene)
         due = np.interp(number * size * volume, flown, times)
         middle = np.interp((number + 0.5) * size * volume, flown, times)
         speeds = np.maximum(value_of(emitter.rate, t=middle), 0.0) / mouth.area
-    return Sheets(mouth, size, max(1, round(layer / max(1, size))), particles, period, due, speeds, volume)
+    return Sheets(mouth, size, max(1, round(layer / max(1, size))), particles, period, lead, due, speeds, volume)
+
+
+def _lead(emitter: Emitter, scene: Scene, mouth: Mouth) -> float:
+    """Return the length of the nozzle of an emitter, m: up to the next face, body or collider, 0 if its rate varies."""
+    lead, step = 0.0, 0.25 * scene.domain.spacing
+    lower = np.array(scene.domain.origin)
+    upper = lower + scene.domain.size
+    for k in range(1, 1 if varies(emitter.rate) else 1 + round(4 * _NOZZLE)):
+        places = mouth.places - k * step * mouth.direction
+        taken = ~((places >= lower) & (places <= upper)).all()
+        taken = taken or any(body.shape.form.contains(places).any() for body in scene.bodies)
+        if taken or any((collider.signed_distance(places) < 0).any() for collider in scene.colliders):
+            break
+        lead = k * step
+    return lead
 
 
 def fastest_inflow(emitter: Emitter, end: float) -> float:

@@ -138,6 +138,9 @@ class Batch:
         colliders = motion = rigid = surfaces = points = None
         if kind.layers.separate:
             surfaces = BodyContact(groups, orders, grid, kind.layers, runs, backend.threads, on_cpu=on_cpu)
+        emission = Emission(kind.inflow, d, runs) if kind.inflow.groups else None
+        for g, group in enumerate(groups if emission else ()):
+            group.pour_from(emission, tuple(e for e, own in emission.members if own == g))
         if kind.colliders.count:
             how = {"on_cpu": on_cpu, "at_rest": kind.settings.solids == "total", "deterministic": deterministic}
             colliders = Colliders(kind.colliders, d, grid.shape, PAD, runs, **how)
@@ -168,7 +171,7 @@ class Batch:
             motion,
             rigid,
             RigidContact(rigid, kind.faces, runs) if rigid else None,
-            Emission(kind.inflow, d, runs) if kind.inflow.groups else None,
+            emission,
             surfaces,
             points,
             ti.field(int, shape=(2 * runs, d)) if on_cpu else None,

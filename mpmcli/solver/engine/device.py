@@ -185,7 +185,7 @@ class RunView:
             _changed(order, grid=self.grid, extent=extent, first_tile=w * (order.bins + 1)) for order in device.orders
         )
         self.groups = tuple(
-            group.seen_from(w) if group.has_body_force or group.repeats else group for group in device.groups
+            group.seen_from(w) if group.is_pushed or group.repeats else group for group in device.groups
         )
 
 

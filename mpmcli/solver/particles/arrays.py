@@ -106,6 +106,7 @@ class ParticleArrays:
         activity: (n) int, status of each particle: waiting, active, retired or blocked (`particles.sort`); None if all
             are always active (`comes_and_goes` is false).
         force: the forces on the particles, if the group `has_body_force`.
+        mouths, emitters: the mouths of emitters, and the indices of those that emit particles of the group.
         run: number of the run of a view.
         table: per body, a row of particle mass, particle volume and the constants of the law.
         kept: per body, the fraction of its motion that it keeps in this step, see `kept_motion`.
@@ -162,6 +163,8 @@ class ParticleArrays:
         self.cell, self.to_mean, self.growth = (made.get(name) for name in ("cell", "volume_to_mean", "volume_growth"))
         self.id, self.body, self.activity = made["id"], made.get("body"), made.get("activity")
         self.has_body_force, self.force, self.run = False, None, 0
+        self.mouths: object = None
+        self.emitters: tuple[int, ...] = ()
         self.repeats = False
         self.period: Period | None = None
         self.table = ti.Vector.field(table[1], float, shape=table[0])
@@ -173,6 +176,14 @@ class ParticleArrays:
 
     def push_by(self, force: object) -> None:
         self.has_body_force, self.force = True, force
+
+    def pour_from(self, mouths: object, emitters: tuple[int, ...]) -> None:
+        self.mouths, self.emitters = mouths, emitters
+
+    @property
+    def is_pushed(self) -> bool:
+        """Whether forces or nozzles accelerate particles."""
+        return self.has_body_force or len(self.emitters) > 0
 
     def repeat(self, period: Period) -> None:
         self.period, self.repeats = period, len(period.axes) > 0

@@ -81,6 +81,7 @@ class Emission:
         velocity: largest velocity of emitted particles, m/s.
         spacing, low: spacing and lower bound of the lattice along these axes, m.
         cells: number of cells along these axes, 1 along the flow.
+        lead: length of the nozzle, m; `centre` is where particles enter it.
         marks: (runs * emitters, cells) int, whether a cell is occupied.
         stretches: (runs, emitters, sheets), time from a sheet to the next one over that at the largest speed; and
             known: the same on the host.
@@ -97,10 +98,11 @@ class Emission:
         )
         self.axes = ti.Matrix.field(d, d, float, shape=(runs, n))
         self.cells = ti.Vector.field(d, int, shape=(runs, n))
+        self.lead = ti.field(float, shape=(runs, n))
         self.marks = ti.field(int, shape=(runs * n, max(1, inflow.cells)))
         self._timed, self.sheets = inflow.sheets > 0, max(1, inflow.sheets)
         self.stretches, self.known = ti.field(float, shape=(runs, n, self.sheets)), np.ones((runs, n, self.sheets))
-        own = self.velocity, self.spacing, self.low, self.cells, self.stretches
+        own = self.velocity, self.spacing, self.low, self.cells, self.lead, self.stretches
         self._rows = Rows(self.ids, self.centre, self.axes, *own)
 
     def write(self, scene: Scene, ids: Sequence[int], run: int = 0) -> list[Sheets]:
@@ -115,12 +117,13 @@ class Emission:
         self._rows.write(
             run,
             [[[own, one.size, one.per_layer, one.particles] for own, one in zip(ids, found, strict=True)]],
-            [[mouth.centre - np.array(scene.domain.origin) for mouth in mouths]],
+            [[one.mouth.centre - one.lead * one.mouth.direction - np.array(scene.domain.origin) for one in found]],
             [[np.vstack([mouth.direction, mouth.across]) for mouth in mouths]],
             [[mouth.direction * fastest_inflow(one, scene.time.end) for one, mouth in pairs]],
             [[mouth.spacing for mouth in mouths]],
             [[[-0.5 * mouth.spacing[0], *mouth.low] for mouth in mouths]],
             [[[1, *mouth.counts] for mouth in mouths]],
+            [[one.lead for one in found]],
             self.known[run : run + 1],
         )
         return found
@@ -144,16 +147,45 @@ class Emission:
                 self.marks[self.row(e, run), index] = 1
 
     @ti.func
+    def steer(
+        self,
+        emitters: ti.template(),
+        group: ti.template(),
+        p: int,
+        kick: float,
+        push: ti.template(),
+        slope: ti.template(),
+    ):
+        """Return the acceleration, m/s^2, and its gradient, that keep a particle in a nozzle at its velocity."""
+        run, after, gradient = group.run, push, slope
+        v, C = group.motion(p)
+        for e in ti.static(emitters):
+            along, lead = self.along(e, run, group.x[p]), self.lead[run, e]
+            inside = along[0] >= self.low[run, e][0] and along[0] < lead
+            for a in ti.static(range(1, self.dimension)):
+                width = self.cells[run, e][a] * self.spacing[run, e][a]
+                inside = inside and along[a] >= self.low[run, e][a] and along[a] <= self.low[run, e][a] + width
+            if inside:
+                after = (self.velocity[run, e] - v) / ti.max(kick, 1e-30)
+                gradient = -C / ti.max(kick, 1e-30)
+        return after, gradient
+
+    @ti.func
+    def along(self, e: ti.template(), run: int, x: ti.template()):
+        """Return the coordinates of a point along the axes of a mouth, m, from where particles enter."""
+        result, away, axes = ti.Vector.zero(float, self.dimension), x - self.centre[run, e], self.axes[run, e]
+        for a, c in ti.static(ti.ndrange(self.dimension, self.dimension)):
+            result[a] += axes[a, c] * away[c]
+        return result
+
+    @ti.func
     def cell_of(self, e: ti.template(), run: int, x: ti.template()):
         """Return the cell of the mouth that contains a point or is nearest to it, and whether it contains the point."""
         inside, index = True, 0
-        away = x - self.centre[run, e]
-        axes, low, spacing, cells = self.axes[run, e], self.low[run, e], self.spacing[run, e], self.cells[run, e]
+        along, low = self.along(e, run, x), self.low[run, e]
+        spacing, cells = self.spacing[run, e], self.cells[run, e]
         for a in ti.static(range(self.dimension)):
-            along = 0.0
-            for c in ti.static(range(self.dimension)):
-                along += axes[a, c] * away[c]
-            place = ti.floor((along - low[a]) / spacing[a])
+            place = ti.floor((along[a] - low[a]) / spacing[a])
             last = ti.cast(cells[a] - 1, float)
             inside = inside and place >= 0.0 and place <= last
             index = index * cells[a] + ti.cast(ti.min(ti.max(place, 0.0), last), int)

@@ -47,7 +47,7 @@ class Loads:
     Attributes:
         share: fraction of its motion that its body keeps.
         missing: mean of ln J over its cell minus its own ln J.
-        push, slope: acceleration by forces, m/s^2, and its gradient, 1/s^2.
+        push, slope: acceleration by forces and nozzles, m/s^2, and its gradient, 1/s^2.
         touch, friction: acceleration by other bodies and by friction on walls, m/s^2.
     """
 
@@ -112,6 +112,8 @@ def loads_on(particles: ti.template(), g: ti.template(), group: ti.template(), p
         missing = missing_to_mean(particles.grid, g, group, p)
     if ti.static(group.has_body_force):
         push, slope = group.force.acceleration(group, p, kick, group.force.spreads)
+    if ti.static(len(group.emitters) > 0):
+        push, slope = group.mouths.steer(group.emitters, group, p, kick, push, slope)
     if ti.static(particles.has_contact):
         touch = particles.contact.push(group, p, particles.grid.spacing, particles.run)
     if ti.static(group.has_wall_friction):
@@ -146,7 +148,7 @@ def hand_over(particles: ti.template(), group: ti.template(), own: ti.template()
         if ti.static(group.uses_f_bar):
             plastic /= stretch
     v, C = own.v, own.C
-    if ti.static(group.has_body_force):
+    if ti.static(group.is_pushed):
         v += kick * own.loads.push
         C += kick * own.loads.slope
     if ti.static(group.total):
