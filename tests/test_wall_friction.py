@@ -33,16 +33,19 @@ def thrown(friction: object, faces: object, dimension: int, **solver: object) ->
     )
 
 
-def stepped(backend: object, scene: Scene, velocity: list[float]) -> tuple[np.ndarray, BodyState]:
-    """Return what a step adds to the momentum of particles at random with one velocity, and the state after it."""
+def stepped(backend: object, scene: Scene, velocity: list[float], shear: float = 0.0) -> tuple[np.ndarray, BodyState]:
+    """Return what a step adds to the momentum of particles at random, and the state after it.
+
+    They have one velocity, or with `shear`, 1/s, that of a flow along a floor at rest, v_x = shear y, as well.
+    """
     d, random = scene.dimension, np.random.default_rng(0)
     n = 60 * 3 ** (d - 2)
     low, high = (np.array(getattr(scene.bodies[0].shape.form, side)) for side in ("min", "max"))
     zero, volume = np.zeros((n, d, d)), float(np.prod(high - low)) / n
-    particles = BodyParticles(
-        "block", random.uniform(low, high, (n, d)), np.tile(velocity, (n, 1)), zero, volume, DENSITY * volume
-    )
-    run = build_run(scene, backend, [particles])
+    x, v = random.uniform(low, high, (n, d)), np.tile(velocity, (n, 1))
+    v[:, 0] += shear * x[:, 1]
+    zero[:, 0, 1] = shear
+    run = build_run(scene, backend, [BodyParticles("block", x, v, zero, volume, DENSITY * volume)])
     before = bodies_of(run)["block"].momentum()
     run.step(1e-4)
     after = bodies_of(run)["block"]
@@ -53,6 +56,7 @@ def stepped(backend: object, scene: Scene, velocity: list[float]) -> tuple[np.nd
     ("dimension", "walls", "settings"),
     [
         (2, "slip", {}),
+        (2, "separate", {"transfer": "aflip"}),
         pytest.param(2, "separate", {"kernel": "cubic"}, marks=pytest.mark.slow),
         pytest.param(3, "separate", {}, marks=pytest.mark.slow),
     ],
@@ -60,7 +64,10 @@ def stepped(backend: object, scene: Scene, velocity: list[float]) -> tuple[np.nd
 def test_a_sliding_body_loses_friction_times_push(
     backend_of: Callable, dimension: int, walls: str, settings: dict
 ) -> None:
-    """Without other forces, Delta p_t = -mu Delta p_n v_t / |v_t|, to f64 round-off, while nothing comes to rest."""
+    """Without other forces, Delta p_t = -mu Delta p_n v_t / |v_t|, to f64 round-off, while nothing comes to rest.
+
+    Of a push that AFLIP gives back to what it keeps, the wall rubs by nothing.
+    """
     velocity = [3.0, -0.1, -4.0][:dimension]
     scene = thrown(on_all(0.2, dimension, y_min=0.35), walls, dimension, **settings)
     change, _ = stepped(backend_of("f64", 1), scene, velocity)
@@ -79,6 +86,17 @@ def test_what_cannot_slip_moves_as_on_a_wall_that_sticks(backend_of: Callable) -
     assert np.abs(slipping.v - expected.v).max() > 0.1
     assert np.abs(found.v - expected.v).max() < 1e-12
     assert np.abs(found.C - expected.C).max() < 1e-10
+
+
+def test_a_flow_along_a_floor_keeps_its_shear(backend_of: Callable) -> None:
+    """Where friction sticks, v_x = gamma y is a flow without slip: a step without stress keeps it, to round-off.
+
+    Mirrored as on a wall that slips, the motion that AFLIP keeps would add up to 0.2 gamma h in every step.
+    """
+    gamma = 2.0
+    _, found = stepped(backend_of("f64", 1), thrown(on_all(1e4), "separate", 2, transfer="aflip"), [0.0, -0.1], gamma)
+    assert np.abs(found.v[:, 1]).max() > 0.01
+    assert np.abs(found.v[:, 0] - gamma * found.x[:, 1]).max() < 1e-4 * gamma * 0.1 + 1e-12
 
 
 def test_friction_takes_energy(backend_of: Callable) -> None:

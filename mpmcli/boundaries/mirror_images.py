@@ -118,7 +118,8 @@ class MirrorImages:
             if ti.static(rubbed):
                 for r, _number, axis, side in ti.static(self.walls.rough):
                     if ti.static(axis in self.walls.axes):
-                        if acts[axis] == 1 and depth[axis] <= 1 and upper[axis] == side:
+                        slides = acts[axis] == 1 and holds[axis] == 0
+                        if slides and depth[axis] <= 1 and upper[axis] == side:
                             impulse = self.walls.impulse[self.walls.first_rough + r, self.walls.plane_index(node, axis)]
                             share = self.shares[0] if depth[axis] == 0 else self.shares[1]
                             for c in ti.static(self.walls.lateral[axis]):
@@ -396,7 +397,8 @@ def column_friction(
         p_w + 2 (m' p + m p') / (m + m')
 
     from a column, along each axis whose sign they reverse: along all axes if the wall sticks. The normal part is the
-    impulse by which the wall pushes.
+    impulse by which the wall pushes. Of the motion that bodies keep, folding takes and returns `kept`. `inertia` is the
+    mass that sticking stops, as if all of it moved with one velocity.
     """
     d = ti.static(images.dimension)
     depth, mirror, upper = images.walls.place(node)
@@ -409,6 +411,7 @@ def column_friction(
             acts[a] = 0
         others = ti.max(others, acts[a])
     taken, slip = ti.Vector.zero(float, d), ti.Vector.zero(float, d)
+    kept, inertia = ti.Vector.zero(float, d), 0.0
     compliance = 0.0
     if pressed:
         # No particle inside the domain reaches the second node beyond a wall.
@@ -418,7 +421,19 @@ def column_friction(
                 if a == axis:
                     inner[a] += j
                     outer[a] -= j
-            # It does not matter which of them lies inside.
+            # It does not matter which of them lies inside. On the wall both are the same node, which counts once.
+            whole = 0.5 if j == 0 else 1.0
+            if ti.static(grid.scheme.keeps_flip_velocity):
+                first, still = ti.static(grid.kept), ti.Vector.zero(float, d)
+                old = grid.part(grid.linear_index(inner), first)
+                beyond = grid.part(grid.linear_index(outer), first)
+                if others > 0:
+                    old = images.image_sum(grid, first, inner, mirror, acts, depth, holds, upper, still)
+                    beyond = images.image_sum(grid, first, outer, mirror, acts, depth, holds, upper, still)
+                if old[d] + beyond[d] > 0:
+                    for c in ti.static(range(d)):
+                        kept[c] += 2 * whole * (beyond[d] * old[c] + old[d] * beyond[c]) / (old[d] + beyond[d])
+                    inertia += 4 * whole * old[d] * beyond[d] / (old[d] + beyond[d])
             here = pulled(grid.part(grid.linear_index(inner), 0), d, gravity_step)
             there = pulled(grid.part(grid.linear_index(outer), 0), d, gravity_step)
             if others > 0:
@@ -431,8 +446,6 @@ def column_friction(
                     there[c] -= there[d] * along[c]
             mass = here[d] + there[d]
             if mass > 0:
-                # On the wall both are the same node, which counts once.
-                whole = 0.5 if j == 0 else 1.0
                 share = 0.0
                 if j == 0:
                     share = images.shares[0]
@@ -445,7 +458,8 @@ def column_friction(
     bound, needed, speed = 0.0, 0.0, 0.0
     for c in ti.static(range(d)):
         if c == axis:
-            bound = coefficient * (taken[c] if side == 1 else -taken[c])
+            push = taken[c] - kept[c]
+            bound = coefficient * (push if side == 1 else -push)
         else:
             needed += taken[c] ** 2
             speed += slip[c] ** 2
@@ -457,8 +471,10 @@ def column_friction(
         if not sticks and speed > 0:
             size = ti.min(bound, speed / compliance) / speed
         for c in ti.static(range(d)):
-            if c != axis:
+            if c == axis:
+                result[c] = 1.0 if sticks else 0.0
+            elif not sticks:
                 result[c] = -size * slip[c]
-            elif sticks:
-                result[c] = 1.0
+            elif inertia > 0:
+                result[c] = kept[c] / inertia
     return result

@@ -126,10 +126,13 @@ class Walls:
         friction: the coefficients of friction.
         rough: of every wall with friction: its index in `rough`, its index in `friction`, axis and side.
         impulse: per rough face of each run and node of its plane, (d,): along the wall, the momentum, kg m/s, that
-            friction adds to a sliding column of nodes; along the normal, 1 if the column sticks, else 0.
+            friction adds to a sliding column of nodes; along the normal, 1 if the column sticks, else 0. If it sticks,
+            the entries along the wall are its slip before the step where bodies keep motion, m/s, else 0.
         first_rough: row of `impulse` of the first rough face.
         moving: velocities of the faces that move.
         moves: whether any face moves.
+        slip: per axis, the velocity of the face, (d, d), m/s, a variable of a kernel that replaces that of `moving`
+            if `slips`, see `slipping`.
         shut: depth at and below which velocities out through a separating wall that does not act are zero, a number or
             a variable of a kernel: 0, or -REACH where bodies touch the wall by their surfaces (`contact.obstacles`).
     """
@@ -149,7 +152,7 @@ class Walls:
         self.faces = tuple(tuple(pair) for pair in faces)
         self.periodic = tuple(a for a, pair in enumerate(self.faces) if PERIODIC in pair)
         self.reach = PERIODIC_REACH if self.periodic else REACH
-        self.moving, self.moves = moving, len(moving.faces) > 0
+        self.moving, self.moves, self.slips = moving, len(moving.faces) > 0, False
         self.first, self.shut = first, 0
         self.last = tuple(first + n for n in cells)
         self.separating = tuple(
@@ -177,6 +180,12 @@ class Walls:
         """Return the walls for nodes that are near walls of `axes` only; distances are those from all walls."""
         walls = copy(self)
         walls.axes = tuple(axes)
+        return walls
+
+    def slipping(self, slip: object) -> "Walls":
+        """Return the walls as they move with the slip of columns that stick by friction, see `slip_at`."""
+        walls = copy(self)
+        walls.slip, walls.slips, walls.moves = slip, True, True
         return walls
 
     @ti.func
@@ -312,6 +321,22 @@ class Walls:
         return holds
 
     @ti.func
+    def slip_at(self, node: ti.template(), depth: ti.template(), upper: ti.template(), holds: ti.template()):
+        """Return, per axis, the slip before the step of a column that sticks by friction, else the wall's velocity."""
+        result = ti.Matrix.zero(float, self.dimension, self.dimension)
+        if ti.static(self.moves):
+            for a in ti.static(self.axes):
+                own = self.velocity(a, upper[a])
+                for c in ti.static(range(self.dimension)):
+                    result[a, c] = own[c]
+        for r, _number, axis, side in ti.static(self.rough):
+            if depth[axis] <= REACH and upper[axis] == side and holds[axis] == 1:
+                entry = self.impulse[self.first_rough + r, self.plane_index(node, axis)]
+                for c in ti.static(self.lateral[axis]):
+                    result[axis, c] = entry[c]
+        return result
+
+    @ti.func
     def stopped(
         self, value: ti.template(), axis: ti.template(), holds: ti.template(), upper: ti.template(), mass: float
     ):
@@ -340,9 +365,13 @@ class Walls:
     def velocity(self, axis: ti.template(), upper: int):
         """Return the velocity of the face of `axis` on that side, m/s."""
         result = ti.Vector.zero(float, self.dimension)
-        for f in ti.static(range(len(self.moving.faces))):
-            if ti.static(self.moving.faces[f][0] == axis):
-                if upper == ti.static(self.moving.faces[f][1]):
-                    for c in ti.static(range(self.dimension)):
-                        result[c] = self.moving.of(f)[c]
+        if ti.static(self.slips):
+            for c in ti.static(range(self.dimension)):
+                result[c] = self.slip[axis, c]
+        else:
+            for f in ti.static(range(len(self.moving.faces))):
+                if ti.static(self.moving.faces[f][0] == axis):
+                    if upper == ti.static(self.moving.faces[f][1]):
+                        for c in ti.static(range(self.dimension)):
+                            result[c] = self.moving.of(f)[c]
         return result

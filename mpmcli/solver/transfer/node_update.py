@@ -46,6 +46,14 @@ class NodeUpdate:
             view.colliders.own = layer
         return view
 
+    def slipping(self, slip: object) -> "NodeUpdate":
+        """Return the update at walls that move with the slip of what sticks by friction, a variable of a kernel."""
+        view = copy(self)
+        if self.needs_friction:
+            view.images = copy(self.images)
+            view.images.walls = self.images.walls.slipping(slip)
+        return view
+
     @ti.func
     def update(self, node: ti.template(), index: int, gravity_step: ti.template()):
         """Update a node and its images; return its squared speed, 0 at an image and at a node without mass.
@@ -130,16 +138,18 @@ class NodeUpdate:
         transfers no momentum between bodies in contact, even if their fractions differ.
 
         Mirror images have this velocity too, so that a wall changes only the contribution of stress; friction acts on
-        the change of velocity.
+        the change of velocity. Where friction sticks, they are mirrored about the slip, which the wall stops.
         """
         first = ti.static(self.grid.kept)
         before = self.grid.part(index, first)
-        depth, _mirror, upper, _acts, holds = ti.static(place)
-        for k, images in ti.static(enumerate(self.images.kinds)):
+        slip = ti.Matrix.zero(float, ti.static(self.dimension), ti.static(self.dimension))
+        if ti.static(self.needs_friction):
+            if kind >= 0:
+                depth, _mirror, upper, _acts, holds = ti.static(place)
+                slip = self.images.walls.slip_at(node, depth, upper, holds)
+        (slipping,) = ti.static((self.slipping(slip),))
+        for k, images in ti.static(enumerate(slipping.images.kinds)):
             if kind == k:
-                by_word = images.walls.holding(node, depth, upper, False)
-                for a in ti.static(images.walls.axes):
-                    holds[a] = by_word[a]
                 pull = ti.Vector.zero(float, ti.static(self.dimension))
                 total = images.fold(self.grid, first, node, place, pull, False)
                 for c in ti.static(range(self.grid.kept)):
@@ -147,7 +157,7 @@ class NodeUpdate:
         mass = before[ti.static(self.dimension)]
         for a in ti.static(range(self.dimension)):
             before[a] = ti.select(mass > 0.0, before[a] / mass, 0.0)
-        self.write(first, node, index, kind, place, before)
+        slipping.write(first, node, index, kind, place, before)
 
     @ti.func
     def write(
