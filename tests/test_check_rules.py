@@ -107,9 +107,9 @@ def test_a_wall_that_is_nearly_touched(cells: float, fires: bool) -> None:
 
 
 def test_bodies_that_separate_begin_where_they_like() -> None:
-    """They act on each other, and on walls that separate, where they touch; one of fluid acts on both from afar."""
+    """They act on each other, and on walls that separate, where they touch; fluid acts on walls from afar."""
     separate = {"contact": {"default": "separate"}, "domain": {"walls": "separate"}}
-    for material, gaps, margins in ((SOLID, 0, 0), (FLUID, 1, 2)):
+    for material, gaps, margins in ((SOLID, 0, 0), (FLUID, 0, 2)):
         bodies = [
             block("low", [0.25, 0.5 * H], [0.5, 0.25]) | {"material": SOLID},
             block("high", [0.25, 0.25 + H], [0.5, 0.75]) | {"material": material},
@@ -152,10 +152,10 @@ def test_solids_that_yield_weld() -> None:
     slides = metal | {"surface_friction": 0.1}
     for one, material, welds in (
         (metal, metal, True),
-        (metal, SOLID, True),
+        (metal, SOLID, False),
         (metal, FLUID, False),
         (slides, slides, False),
-        (slides, metal, True),
+        (slides, metal, False),
     ):
         findings = found("weld", [low | {"material": one}, high | {"material": material}])
         assert [finding.severity for finding in findings] == ["note"] * welds

@@ -123,10 +123,10 @@ def _sticking(facts: SceneFacts) -> Iterator[Finding]:
 
 
 def _welding(facts: SceneFacts) -> Iterator[Finding]:
-    """Yield solids that weld on contact, because those that yield share one velocity field with all others."""
+    """Yield solids that weld on contact, because those that yield share one velocity field."""
     scene = facts.scene
     yielding = [one.name for one in scene.sources if one.material.law in WELDING and not scene.separates(one)]
-    if yielding and len(yielding) + sum(one.has_surface for one in scene.sources) > 1:
+    if yielding and len(yielding) + sum(one.has_surface and not scene.parts for one in scene.sources) > 1:
         what = f"The material of {several(quoted(yielding))} yields: solids that it meets weld to it, and do not slide."
         fix = "Nothing needs to be done; with a surface_friction, metal and clay separate."
         yield Finding("note", "weld", what, fix, len(yielding), yielding[0])

@@ -397,10 +397,9 @@ def _paired(scene: Scene) -> Iterator[Problem]:
         earlier = seen.setdefault(frozenset(pair.between), k)
         if earlier != k:
             yield Problem(path, f"names the bodies of contact.pairs[{earlier}]; leave one of them out")
-        for name in pair.between:
-            if pair.friction != "stick" and name in sources and not sources[name].has_surface:
-                said = f'"{name}" cannot separate: only a body of an elastic law, or of metal with a surface_friction, '
-                yield Problem(path, said + 'and not one of points, can; give friction = "stick"')
+        if pair.friction != "stick" and not unknown and not any(sources[name].has_surface for name in pair.between):
+            said = f'"{first}" and "{second}" cannot separate: one must be of an elastic law, or of metal with a '
+            yield Problem(path, said + 'surface_friction, and not one of points; give friction = "stick"')
 
 
 def _total(scene: Scene) -> Iterator[Problem]:

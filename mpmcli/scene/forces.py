@@ -145,14 +145,15 @@ class Contact(Table):
 
     default: Literal["auto", "stick", "separate"] = Field(
         "auto",
-        description='"separate": each elastic body has a velocity field of its own; they meet each other, and walls '
-        "and colliders that separate, where their surfaces are, slide with friction, and part. Liquids, grains and "
-        'bodies that yield stick to all others. "stick": bodies share one velocity field, meet up to two cells before '
-        'they touch, and do not slide. "auto": "separate" with several elastic bodies, or with one among others and '
-        "walls or colliders that separate, unless settings of the solver or rigid bodies exclude it; otherwise "
-        '"stick".',
+        description='"separate": each elastic body has a velocity field of its own; they meet each other, all other '
+        "material, and walls and colliders that separate, where their surfaces are, slide with friction, and part. "
+        'Liquids, grains and bodies that yield stick to each other. "stick": bodies share one velocity field, meet up '
+        'to two cells before they touch, and do not slide. "auto": "separate" with an elastic body among others, '
+        'unless settings of the solver or rigid bodies exclude it; otherwise "stick".',
     )
     friction: NotNegative | None = Field(
-        None, description="Coefficient of Coulomb friction. Default: the softer body's, `surface_friction`."
+        None,
+        description="Coefficient of Coulomb friction, 0 for liquids. Default: that of the elastic body, the softer of "
+        "two, `surface_friction`.",
     )
     pairs: tuple[ContactPair, ...] = Field((), description="Pairs of bodies with contact of their own.")

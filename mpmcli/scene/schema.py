@@ -378,23 +378,24 @@ class Scene(Table):
         for pair in self.contact.pairs:
             if set(pair.between) == {first.name, second.name}:
                 return None if pair.friction == "stick" else pair.friction
-        if not (self.parts and first.has_surface and second.has_surface):
+        bodies = [body for body in (first, second) if body.has_surface]
+        if not (self.parts and bodies):
             return None
+        if any(body.material.hydrostatic for body in (first, second)):
+            return 0.0
         if self.contact.friction is not None:
             return self.contact.friction
         # That of the softer body, the lower of two equally soft ones; a plugin's law may have none.
-        materials = (first.material, second.material)
+        materials = [body.material for body in bodies]
         return min((own.shear_modulus, getattr(own, "surface_friction", 0.0)) for own in materials)[1]
 
     @property
     def parts(self) -> bool:
-        """Whether elastic bodies separate that are not in `contact.pairs`."""
+        """Whether elastic bodies separate from all that are not in `contact.pairs`."""
         if self.contact.default != "auto":
             return self.contact.default == "separate"
-        elastic, others = sum(source.has_surface for source in self.sources), len(self.sources) > 1
-        faces = (word for pair in self.domain.walls.faces(self.dimension) for word in pair)
-        obstacles = "separate" in faces or any(collider.wall == "separate" for collider in self.colliders)
-        return (elastic > 1 or (elastic == 1 and others and obstacles)) and not self.one_field
+        elastic = any(source.has_surface for source in self.sources)
+        return elastic and len(self.sources) > 1 and not self.one_field
 
     @property
     def one_field(self) -> str:

@@ -13,12 +13,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from mpmcli.boundaries.colliders import DEEP
 from mpmcli.boundaries.loads import Loads
 from mpmcli.boundaries.rows import Rows
 from mpmcli.materials.elementary import exp, log
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
 from mpmcli.scene.sampling import lattice_spacing
+from mpmcli.solver.contact.collider_points import EMPTY, FREE, FULL, LEAST, smooth
 from mpmcli.solver.contact.layers import Layers
 from mpmcli.solver.contact.surfaces import FAR, REACH, BodySurfaces, place_of
 from mpmcli.solver.grid.grid import Grid
@@ -124,6 +126,9 @@ class BodyContact:
         layers, h = Layers.of(scene), scene.domain.spacing
         self._count.write(run, [layers.count])
         rows, bands = np.zeros((layers.count, FRICTION)), np.zeros(layers.count)
+        shared = [scene.sources[i].material.density for i in range(len(layers.numbers)) if not layers.has_own(i)]
+        if shared:
+            rows[0, DENSITY] = min(shared)
         for source, layer in enumerate(layers.numbers):
             if layers.has_own(source):
                 material, distance = scene.sources[source].material, lattice_spacing(scene.sources[source], h)
@@ -248,6 +253,11 @@ class BodyContact:
         if friction < 0.0:
             for b in ti.static(range(d)):
                 J[b] = -reduced * u[b]
+        elif bodies and a < ti.static(int(self.surfaces.shares)):
+            change = self.stopped(grid, obstacles, w, thread, node, index, c, u, friction)
+            for b in ti.static(range(d)):
+                J[b] = reduced * change[b]
+            self.loads.add(w, node, ti.static(self.pairs), 0, reduced * change.dot(u + 0.5 * change))
         elif bodies or way < REACH * h:
             gap, n, aside, kappa, deepest = self.separation(
                 grid, obstacles, w, thread, node, index, a, c, way, facing, reduced, 2.0 / soft * dt**2
@@ -274,6 +284,84 @@ class BodyContact:
                 self.loads.take(w, node, ti.raw_div(c * (c - 1), 2) + a, -J, place_of(node, h))
             elif ti.static(obstacles.any):
                 obstacles.take(c - self.layers, node, place_of(node, h), J)
+
+    @ti.func
+    def stopped(
+        self,
+        grid: ti.template(),
+        obstacles: ti.template(),
+        w: int,
+        thread: int,
+        node: ti.template(),
+        index: int,
+        c: int,
+        u: ti.template(),
+        friction: float,
+    ):
+        """Return the change of the velocity u of body c relative to the shared field at a node, m/s.
+
+        A share of their approach ends, which depends on how far the kernel of the nearest point of the surface is
+        filled outside of the body. Far inside the body all of u ends.
+        """
+        h, d, row = ti.static((grid.spacing, self.dimension, w * self.layers + c))
+        change = -u
+        _n_a, n, counts, _slopes = self.collect(grid, obstacles, w, thread, node, index, 0, c)
+        if counts[1] > 0:
+            # Points of the second body have the opposite sign.
+            first, beta = (2 * thread + 1) * self.share, self.rows[row, SHARPNESS]
+            total = self.sum_points(first, counts[1], -n, beta, ti.static(0.5 / BALL) * grid.inverse_spacing)
+            far = -log(ti.max(total * self.rows[row, FLAT], SMALLEST)) / beta
+            share, approach = 1.0, ti.max(u.dot(n), 0.0)
+            if approach > 0.0 and far > DEEP * h:
+                filled = self.share_filled(grid, obstacles.walls, w, c, place_of(node, h) - far * n)
+                share = smooth((filled - EMPTY) / (FULL - EMPTY))
+            along = u - u.dot(n) * n
+            rub = ti.min(friction * approach, along.norm()) / ti.max(along.norm(), SMALLEST)
+            for b in ti.static(range(d)):
+                change[b] = -share * (approach * n[b] + rub * along[b])
+        return change
+
+    @ti.func
+    def share_filled(self, grid: ti.template(), walls: ti.template(), w: int, c: int, y: ti.template()):
+        """Return the share of the kernel of a point outside of body c that the shared field fills."""
+        h, d, nodes = ti.static((grid.spacing, self.dimension, grid.scheme.spline.nodes))
+        base, _ = grid.scheme.spline.stencil(y, grid.inverse_spacing)
+        full, filled = 0.0, 0.0
+        for q in range(ti.static(2 * nodes**d)):
+            node, weight, rest = base, 1.0, q
+            for b in ti.static(range(d)):
+                after = ti.raw_div(rest, nodes)
+                # The place of a point is uncertain where normals differ, but no node is off the grid.
+                node[b] = ti.min(ti.max(base[b] + rest - after * nodes, 0), ti.static(grid.shape[b] - 1))
+                rest = after
+                weight *= grid.scheme.spline.at(ti.cast(node[b] - PAD, float) - y[b] * grid.inverse_spacing)
+            mass, free = self.room_at(grid, walls, w, c, node)
+            if q < ti.static(nodes**d):
+                full = ti.max(full, ti.select(free > FREE, mass / ti.max(free, FREE), 0.0))
+            elif full > 0.0:
+                most = ti.min(full, self.rows[w * self.layers, DENSITY] * h**d)
+                filled += weight * ti.min(mass / (most * ti.max(free, LEAST)), 1.0)
+        return filled
+
+    @ti.func
+    def room_at(self, grid: ti.template(), walls: ti.template(), w: int, c: int, node: ti.template()):
+        """Return the mass of the shared field at a node, kg, and the share of the kernel inside walls outside of c."""
+        h, d, layer = ti.static((grid.spacing, self.dimension, w * self.layers + c))
+        place, free, used = node, 1.0, True
+        for a in ti.static(range(d)):
+            if ti.static(a in grid.period.axes):
+                cells = grid.period.cells[w][a]
+                place[a] += ti.select(node[a] < PAD, cells, ti.select(node[a] < PAD + cells, 0, -cells))
+            else:
+                for beyond in ti.static((node[a] - walls.first, walls.last[a] - node[a])):
+                    free *= grid.scheme.spline.share_below(ti.cast(beyond, float))
+            beyond = place[a] - self.surfaces.used[2 * layer, a]
+            used = used and beyond >= 0 and beyond < self.surfaces.used[2 * layer + 1, a]
+        index = grid.linear_index(place)
+        if used:
+            mass = self.surfaces.total(grid, place, index, c * ti.static(self.node_count))[d]
+            free -= mass / (self.rows[layer, DENSITY] * h**d)
+        return self.surfaces.total(grid, place, index, 0)[d], free
 
     @ti.func
     def impulse(
@@ -347,7 +435,7 @@ class BodyContact:
         """
         h, d, row = ti.static((grid.spacing, self.dimension, w * self.layers))
         gap, normal, far, kappa, deepest = 0.0, ti.Vector.zero(float, d), ti.Vector.zero(float, 2), -1.0, 0.0
-        n_a, n_c, counts, slopes = self.collect(grid, w, thread, node, index, a, c)
+        n_a, n_c, counts, slopes = self.collect(grid, obstacles, w, thread, node, index, a, c)
         if ti.static(obstacles.any):
             if c >= self.layers:
                 gap, area, off, axis, most = self.springs(
@@ -537,7 +625,17 @@ class BodyContact:
         return gap, axis, middle
 
     @ti.func
-    def collect(self, grid: ti.template(), w: int, thread: int, node: ti.template(), index: int, a: int, c: int):
+    def collect(
+        self,
+        grid: ti.template(),
+        obstacles: ti.template(),
+        w: int,
+        thread: int,
+        node: ti.template(),
+        index: int,
+        a: int,
+        c: int,
+    ):
         """Store the surface points of layers a and c near a node.
 
         Return their outward normals, the numbers of points, and dv/dn of both, a row each, 1/s.
@@ -557,6 +655,9 @@ class BodyContact:
                             while p >= 0:
                                 layer = self.surfaces.shown[g][p]
                                 side = ti.select(layer == a, 0, ti.select(layer == c, 1, -1))
+                                if ti.static(self.surfaces.shares):
+                                    if a == 0 and self.on_face(grid, obstacles.walls, g, p):
+                                        side = -1
                                 if side >= 0:
                                     outwards = ti.select(side == 0, 1.0, -1.0)
                                     n, way, weight = ti.Vector.zero(float, d), ti.Vector.zero(float, d), 1.0
@@ -590,6 +691,18 @@ class BodyContact:
         for side, b in ti.static(ti.ndrange(2, d)):
             slopes[side, b] /= ti.max(weights[side], SMALLEST)
         return n_a.normalized(SMALLEST), n_c.normalized(SMALLEST), counts, slopes
+
+    @ti.func
+    def on_face(self, grid: ti.template(), walls: ti.template(), g: ti.template(), p: int):
+        """Return whether the surface point of a particle is on a face of the domain, where only bodies can meet it."""
+        h, d = ti.static((grid.spacing, self.dimension))
+        result = False
+        for a in ti.static(range(d)):
+            n = self.surfaces.surface[g][p][a]
+            y = self.surfaces.groups[g].x[p][a] + self.surfaces.surface[g][p][d] * n
+            last = ti.cast(walls.last[a] - walls.first, float) * h
+            result = result or (ti.abs(n) > ALIKE and ti.min(y, last - y) < 0.25 * h)
+        return result
 
     @ti.func
     def sum_points(self, first: int, count: int, axis: ti.template(), beta: float, inverse_width: float):

@@ -58,14 +58,16 @@ class Layers:
         return self.numbers[source] > 0 or not self.shares
 
     def frictions(self, scene: Scene) -> np.ndarray:
-        """Return the coefficient of friction of each pair of layers, (count, count), `STICKS` for sticking pairs."""
-        result = np.full((self.count, self.count), STICKS)
+        """Return the coefficient of friction of each pair of layers, (count, count), `STICKS` for sticking pairs.
+
+        Of the bodies that share layer 0 the one with the lowest counts, and any that sticks.
+        """
+        result = np.full((self.count, self.count), np.inf)
         for i, one in enumerate(scene.sources):
             for k, other in enumerate(scene.sources[:i]):
-                friction = scene.friction_between(one, other)
-                if friction is not None:
-                    a, c = self.numbers[i], self.numbers[k]
-                    result[a, c] = result[c, a] = friction
+                friction, a, c = scene.friction_between(one, other), self.numbers[i], self.numbers[k]
+                result[a, c] = result[c, a] = min(result[a, c], STICKS if friction is None else friction)
+        result[np.isinf(result)] = STICKS
         return result
 
 

@@ -386,7 +386,7 @@ class BodySurfaces:
             place, far = self.place_of(grid, w, grid.linear_index(node)), node[last]
             for k in range(grid.row_length(node)):
                 bodies = self.bodies_at(place + k)
-                met = ti.cast(bodies > 1, int)
+                met = ti.cast(self.present[place + k] > 255, int)
                 if ti.static(obstacles.any):
                     if bodies > 0 and node[last] >= far:
                         cells = obstacles.nearest(place_of(node, grid.spacing), REACH) * grid.inverse_spacing
@@ -445,7 +445,7 @@ class BodySurfaces:
                     present = 256 * present + layer + 1
         self.present[place] = present
         bodies = self.bodies_at(place)
-        met = ti.cast(bodies > 1, int)
+        met = ti.cast(present > 255, int)
         if ti.static(obstacles.any):
             if bodies > 0:
                 met += 2 * ti.cast(obstacles.nearest(place_of(node, grid.spacing), REACH) < REACH * grid.spacing, int)

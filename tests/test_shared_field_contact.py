@@ -1,0 +1,108 @@
+"""Elastic bodies and the liquid, sand and snow that share a field meet at surfaces, slide, part, and make no energy."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from solver_state import scene_of
+
+from mpmcli.scene import Scene
+from mpmcli.solver.engine.run import build_run
+
+H, G = 0.05, 9.81
+WATER = {"law": "fluid", "density": 1000.0, "bulk_modulus": 4e5}
+SAND = {"law": "sand", "density": 1600.0, "youngs_modulus": 3e6, "poissons_ratio": 0.3, "friction_angle": 35.0}
+JELLY = {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 1e6, "poissons_ratio": 0.3}
+
+
+def body(name: str, material: dict, low: list[float], high: list[float], **more: object) -> dict:
+    """Return a box; coordinates in cells."""
+    shape = {"box": {"min": [H * x for x in low], "max": [H * x for x in high]}}
+    return {"name": name, "material": material, "shape": shape} | more
+
+
+def scene(bodies: list[dict], end: float, walls: object = "separate", **tables: object) -> Scene:
+    """Return bodies in a domain of 48 x 32 cells."""
+    domain = {"size": [48 * H, 32 * H], "spacing": H, "gravity": [0.0, -G], "walls": walls}
+    tables = {"contact": {"default": "separate"}} | tables
+    return scene_of(domain=domain | tables.pop("domain", {}), time={"end": end, "frames": 40}, bodies=bodies, **tables)
+
+
+def energies(rows: list) -> np.ndarray:
+    """Return the energy of each row in that which its mass has a cell higher."""
+    return np.array([(row.kinetic + row.potential + row.elastic) / (row.mass * G * H) for row in rows])
+
+
+@pytest.mark.parametrize(
+    ("material", "offset"), [pytest.param(WATER, 0.0, marks=pytest.mark.slow), (WATER, 0.4), (SAND, 0.3)]
+)
+def test_what_falls_on_jelly_lies_on_its_surface(backend_of: Callable, material: dict, offset: float) -> None:
+    """Its centre half its height above the surface, to 0.2 cells (1.1 to 1.7 with one field); no energy is made."""
+    top = 8 + offset
+    jelly = body("jelly", JELLY | {"youngs_modulus": 1e7}, [0, 0], [48, top])
+    asked = scene([jelly, body("falls", material, [0, top + 3], [48, top + 11])], 1.5)
+    frames = list(build_run(asked, backend_of("f32", 1)).frames())
+    places = [frame.position[:, 1] / H for frame, _ in frames]
+    labels = frames[0][0].body
+    heights = np.array([y[labels == 1].mean() - 2 * y[labels == 0].mean() for y in places[-8:]])
+    assert heights.mean() == pytest.approx(4, abs=0.2)
+    assert min(y[labels == 1].min() - 2 * y[labels == 0].mean() for y in places) > 0
+    energy = energies([row for _, row in frames])
+    assert (energy - np.minimum.accumulate(energy)).max() < 1e-3
+
+
+@pytest.mark.parametrize("fall", [0.0, pytest.param(2.0, marks=pytest.mark.slow)])
+def test_a_block_of_jelly_floats_at_its_depth(backend_of: Callable, fall: float) -> None:
+    """At half its density half of it is below the level of the water (1.0 to 2.4 cells too high with one field)."""
+    top = 16.0
+    pool = body("water", WATER, [0, 0], [48, top], initial_pressure="hydrostatic")
+    low, high = [16, top - 4 + fall], [32, top + 4 + fall]
+    pool["shape"]["subtract"] = [body("", {}, low, high)["shape"]]
+    block = body("jelly", JELLY | {"density": 500.0}, low, high)
+    frames = list(build_run(scene([pool, block], 8.0), backend_of("f32", 1)).frames())
+    draughts, water = [], frames[0][0].body == 0
+    for frame, _ in frames[20:]:
+        x, y = (frame.position / H).T
+        beside, columns = water & (np.abs(x - 24) > 11), x.astype(int)
+        level = np.mean([y[beside & (columns == column)].max() + 0.25 for column in np.unique(columns[beside])])
+        draughts.append(level - y[~water].mean() + 4)
+    assert np.mean(draughts) == pytest.approx(4, abs=0.12)
+
+
+@pytest.mark.parametrize(
+    ("material", "friction", "offset"),
+    [
+        (SAND, 0.2, 0.3),
+        pytest.param(SAND, 0.0, 0.0, marks=pytest.mark.slow),
+        pytest.param(WATER, 0.0, 0.3, marks=pytest.mark.slow),
+    ],
+)
+def test_layers_slide_down_jelly(backend_of: Callable, material: dict, friction: float, offset: float) -> None:
+    """With g (sin - mu cos) down a slope of 20 degrees."""
+    a, top = np.radians(20), 8 + offset
+    bodies = [body("jelly", JELLY | {"youngs_modulus": 1e7}, [0, 0], [48, top])]
+    bodies.append(body("layer", material, [0, top], [48, top + 6]))
+    asked = scene(
+        bodies,
+        0.4,
+        {"default": "periodic", "y_min": "stick", "y_max": "separate"},
+        contact={"default": "separate", "pairs": [{"between": ["layer", "jelly"], "friction": friction}]},
+        domain={"gravity": [G * np.sin(a), -G * np.cos(a)]},
+    )
+    frames = [frame for frame, _ in build_run(asked, backend_of("f32", 1)).frames()]
+    speed = [frame.velocity[frame.body == 1][:, 0].mean() for frame in frames[4:]]
+    found = np.polyfit([frame.time for frame in frames[4:]], speed, 1)[0]
+    assert found == pytest.approx(G * (np.sin(a) - friction * np.cos(a)), rel=5e-3)
+
+
+def test_momentum_is_exact(backend_of: Callable) -> None:
+    """And energy only falls, as water hits a block that flies freely."""
+    bodies = [body("jelly", JELLY, [20.3, 12.2], [28.3, 20.2])]
+    bodies.append(body("water", WATER, [14, 12.7], [19, 20.7], velocity=[3.0, 0.5]))
+    asked = scene(bodies, 0.1, domain={"gravity": [0.0, 0.0]}, solver={"precision": "f64", "redistribute": False})
+    rows = [row for _, row in build_run(asked, backend_of("f64", 1)).frames()]
+    momentum = np.array([[*row.linear_momentum, *np.ravel(row.angular_momentum)] for row in rows])
+    assert np.abs(momentum - momentum[0]).max() < 1e-12 * np.abs(momentum).max()
+    assert rows[-1].kinetic < 0.9 * rows[0].kinetic
+    energy = np.array([row.kinetic + row.elastic for row in rows])
+    assert (energy - np.minimum.accumulate(energy)).max() < 1e-6 * energy[0]
