@@ -301,7 +301,7 @@ class BodyContact:
         """Return the change of the velocity u of body c relative to the shared field at a node, m/s.
 
         A share of their approach ends, which depends on how far the kernel of the nearest point of the surface is
-        filled outside of the body. Far inside the body all of u ends.
+        filled outside of the body. Deeper than DEEP all of u ends, and as far outside nothing.
         """
         h, d, row = ti.static((grid.spacing, self.dimension, w * self.layers + c))
         change = -u
@@ -312,7 +312,10 @@ class BodyContact:
             total = self.sum_points(first, counts[1], -n, beta, ti.static(0.5 / BALL) * grid.inverse_spacing)
             far = -log(ti.max(total * self.rows[row, FLAT], SMALLEST)) / beta
             share, approach = 1.0, ti.max(u.dot(n), 0.0)
-            if approach > 0.0 and far > DEEP * h:
+            if far > -DEEP * h:
+                # Light nodes would follow the field, which crushes the outermost particles of the body.
+                share = 0.0
+            elif approach > 0.0 and far > DEEP * h:
                 filled = self.share_filled(grid, obstacles.walls, w, c, place_of(node, h) - far * n)
                 share = smooth((filled - EMPTY) / (FULL - EMPTY))
             along = u - u.dot(n) * n
