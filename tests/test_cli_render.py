@@ -93,7 +93,10 @@ shape = { box = { min = [0.8, 0.0], max = [0.9, 0.2] } }
 
 
 def test_a_scene_is_drawn_as_it_starts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Bodies, the first layer of each emitter, colliders, and arrows as long as the speeds; nothing else is left."""
+    """Bodies, the first layer of each emitter, colliders, and arrows as long as the speeds; nothing else is left.
+
+    The layer is where it enters, two cells before the mouth.
+    """
     monkeypatch.chdir(tmp_path)
     Path("start.toml").write_text(SCENE_WITH_ALL, encoding="utf-8")
     said = json.loads(run_here("render", "start.toml", "--workers", 1, "--json").stdout)
@@ -119,17 +122,17 @@ def test_a_scene_is_drawn_as_it_starts(tmp_path: Path, monkeypatch: pytest.Monke
 
     jelly, water = (np.argwhere(near(APPEARANCES[name].ink) & inside) for name in ("jelly", "water"))
     assert place(*jelly.mean(axis=0)) == pytest.approx((0.2, 0.2), abs=0.01)
-    assert place(*water.mean(axis=0)) == pytest.approx((0.7, 0.45), abs=0.01)
+    assert place(*water.mean(axis=0)) == pytest.approx((0.7, 0.49), abs=0.01)
     assert np.ptp(water[:, 1]) / (right - left) == pytest.approx(0.2, abs=0.02)
     post = np.argwhere(near(THEMES["light"].solid) & inside & (np.arange(pixels.shape[0]) > top)[:, None])
     assert place(*np.median(post, axis=0)) == pytest.approx((0.85, 0.1), abs=0.02)
-    # The jet's arrow begins at its mouth and goes down by 0.15 m; the block's is half as long.
+    # The jet's arrow begins where the jet enters and goes down by 0.15 m; the block's is half as long.
     dark = near(THEMES["light"].text, 20)
     column = round(left + 0.7 * (right - left))
     arrow = np.flatnonzero(dark[top + 10 : bottom - 10, column]) + top + 10
     # Its speed stands below.
     arrow = np.split(arrow, np.flatnonzero(np.diff(arrow) > 3) + 1)[0]
-    assert place(arrow.max(), column)[1] == pytest.approx(0.3, abs=0.02)
+    assert place(arrow.max(), column)[1] == pytest.approx(0.34, abs=0.02)
     assert json.loads(run_here("render", "start.toml", "--json").stdout)["made"] == 0
     assert "--frame is for results" in refused("start.toml", "--frame", "first", "-o", "other.png")
 
