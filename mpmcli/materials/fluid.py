@@ -150,8 +150,8 @@ def soft_bulk_modulus(density: float, compressibility: float, bounds: SceneBound
 def relaxed_volume(J: float, seen: float, crossings: float, rate: float, opens: float):
     """Return J after relaxation towards `seen`, the value on the grid, and the part of its change that causes pressure.
 
-    Above 1 J follows at once (docs/theory.md, 5.11); below, by the share `rate` while
-    sound crosses a cell. Where `opens` is 0 the volume may not grow.
+    Above 1 J follows at once (docs/theory.md, 5.11); below, by the share `rate` while sound crosses a cell. Where
+    `opens` is 0 the volume may not grow.
     """
     free = J
     if J >= 1.0:

@@ -156,12 +156,14 @@ class Emission:
         push: ti.template(),
         slope: ti.template(),
     ):
-        """Return the acceleration, m/s^2, and its gradient, that keep a particle in a nozzle at its velocity."""
+        """Return the acceleration, m/s^2, and its gradient, that keep particles of a nozzle in it at their velocity."""
         run, after, gradient = group.run, push, slope
         v, C = group.motion(p)
         for e in ti.static(emitters):
-            along, lead = self.along(e, run, group.x[p]), self.lead[run, e]
-            inside = along[0] >= self.low[run, e][0] and along[0] < lead
+            along, own = self.along(e, run, group.x[p]), group.id[p] - self.ids[run, e][0]
+            # Other material that gets there passes.
+            inside = own >= 0 and own < self.ids[run, e][3]
+            inside = inside and along[0] >= 0.0 and along[0] < self.lead[run, e]
             for a in ti.static(range(1, self.dimension)):
                 width = self.cells[run, e][a] * self.spacing[run, e][a]
                 inside = inside and along[a] >= self.low[run, e][a] and along[a] <= self.low[run, e][a] + width
