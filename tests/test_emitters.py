@@ -130,6 +130,15 @@ def test_the_jet_flows_as_its_velocity_says(jet: Output) -> None:
         assert not frame.velocity[status == 0].any()
 
 
+def test_other_material_passes_a_nozzle(backend_of: Callable[..., Backend]) -> None:
+    """A block of the same law flies across the nozzle before anything enters, and keeps its velocity."""
+    block = {"name": "pool", "material": WATER, "shape": box([0.075, 0.025], [0.125, 0.1]), "velocity": [0.0, 1.0]}
+    emitter = jet_scene().model_dump(exclude_none=True)["emitters"][0] | {"start": 0.5}
+    scene = jet_scene(bodies=[block], emitters=[emitter], time={"end": 0.6, "frames": 6})
+    for frame, _ in outputs_of(batch_of([scene], backend_of("f32", 1)), [scene])[0][:4]:
+        assert np.abs(frame.velocity[frame.body == 0] - [0.0, 1.0]).max() < 1e-3
+
+
 def test_a_jet_whose_rate_varies(backend_of: Callable[..., Backend]) -> None:
     """The mass is rho int q dt, to two sheets and a step, and the momentum rho int q^2 dt / area."""
     pulse = {"velocity": [1.0, 0.0], "rate": "0.2 * (0.6 + 0.4 * cos(9*t))"}
