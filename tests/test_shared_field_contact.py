@@ -114,7 +114,8 @@ def test_a_block_of_jelly_floats_at_its_depth(
 def test_water_and_soft_jelly_make_no_energy(backend_of: Callable, name: str, record_property: Callable) -> None:
     """A dam of 0.5 m meets a block of 15 kPa, and a block falls 0.2 m into a pool: at most 2 % above the start.
 
-    Lengths and the modulus are five times as large here.
+    Lengths and the modulus are five times as large here. `check` subtracts the work of contact, and says that 2 and
+    29 % of the energy turned over are made. In half the step that is less than half; the energy itself rises by 7e-5.
     """
     soft = {"law": "fixed_corotated", "density": 1020.0, "youngs_modulus": 7.5e4, "poissons_ratio": 0.45}
     boxes = {"dam": ([60, 0], [72, 20], [0, 0], [30, 50]), "fall": ([30, 40], [46, 50], [0, 0], [80, 20])}[name]
