@@ -122,7 +122,8 @@ def crater_3d(result: Result) -> str:
     rows, ball, bed = result.ledger, result.colliders[0], 0.12
     heights = [row.rigid_pose[0][2] - 0.05 - bed for row in (rows[0], rows[-1])]
     fallen = 2.5**2 / (2 * 9.81) + heights[0] - heights[1]
-    asked = 0.14 / math.tan(math.radians(35)) * math.sqrt(ball.density / 1600) * 0.1 ** (2 / 3) * fallen ** (1 / 3)
+    # The tangent of the angle of repose is the sine of the friction angle.
+    asked = 0.14 / math.sin(math.radians(35)) * math.sqrt(ball.density / 1600) * 0.1 ** (2 / 3) * fallen ** (1 / 3)
     return f"ball {-heights[1]:.4f} m deep; balls dropped into grains (Uehara et al. 2003) {asked:.4f}"
 
 

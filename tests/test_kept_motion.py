@@ -1,15 +1,17 @@
 """What bodies keep of their motion in steps shorter than their own (docs/theory.md, 2.3)."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from solver_state import scene_of
+from solver_state import bodies_of, scene_of
 
-from mpmcli.scene import Scene
+from mpmcli.scene import Scene, sample_bodies
 from mpmcli.solver.engine.run import build_run
 from mpmcli.solver.machine.backend import Backend
-from mpmcli.solver.transfer.kept_motion import kept_share
+from mpmcli.solver.machine.plan import law_objects
+from mpmcli.solver.transfer.kept_motion import OWN_STEP, kept_share, own_limit
 from mpmcli.validation.case import Setting
 from mpmcli.validation.cases import all_cases
 from mpmcli.validation.runs import scene_of as scene_of_case
@@ -50,6 +52,30 @@ def test_n_short_steps_lose_what_one_does() -> None:
 )
 def test_only_scenes_with_short_steps_store_shares(backend_of: Callable, scene: Scene, kept: bool) -> None:
     assert (build_run(scene, backend_of("f64", 1)).grid.scheme.keeps_flip_velocity) == kept
+
+
+@pytest.mark.parametrize(("part", "kept"), [(1.0, 0.85), (0.5, 0.925), (0.1, 0.985)])
+def test_sand_keeps_a_share_of_what_nodes_do_not_see(backend_of: Callable, part: float, kept: float) -> None:
+    """Rows half a cell apart that move in opposite ways sum to zero at all nodes: a step leaves a share of all of it.
+
+    Sand keeps 0.85 in a step of its own, and loses as much per second in shorter ones.
+    """
+    sand = {"law": "sand", "density": 1600.0, "youngs_modulus": 1e6, "friction_angle": 35.0}
+    shape = {"box": {"min": [0.2, 0.2], "max": [0.8, 0.8]}}
+    scene = scene_of(
+        domain={"size": [1.0, 1.0], "spacing": 0.1},
+        time={"end": 1.0, "frames": 1},
+        solver={"precision": "f64"},
+        bodies=[{"name": "sand", "material": sand, "shape": shape, "sampling": "lattice"}],
+    )
+    sample = sample_bodies(scene)[0]
+    row = np.round(sample.position / 0.05 - 0.5).astype(int)
+    velocity = 1e-6 * (-1.0) ** row.sum(axis=1)[:, None] * [1.0, 0.5]
+    run = build_run(scene, backend_of("f64", 1), [replace(sample, velocity=velocity)])
+    run.step(OWN_STEP * part * own_limit(scene.sources[0], law_objects(scene)[0], scene))
+    after = bodies_of(run)["sand"]
+    middle = np.abs(after.x - 0.5).max(axis=1) < 0.15
+    assert after.v[middle] == pytest.approx(kept * velocity[middle], rel=1e-5)
 
 
 @pytest.mark.parametrize("solids", ["updated", pytest.param("total", marks=pytest.mark.slow)])

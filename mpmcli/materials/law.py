@@ -88,6 +88,7 @@ class Law(ABC):
         flows: whether it is a liquid or grains, whose volume the ledger compares with the volume filled on the grid.
         shifts: whether particles are shifted out of crowds (docs/theory.md, 5.12).
         opens_at_surfaces: whether `relax` applies near free surfaces, too, compared with the density below a plane one.
+        lost: fraction of the motion not resolved by nodes that it loses in a step of its own (docs/theory.md, 2.3).
         elastic: whether the stress is a function of F alone, so that the body can be computed on the grid of its state
             at rest (docs/theory.md, 2.6).
         sensitivity: growth of the logarithm of the largest stiffness per stored strain, dimensionless. It sets how
@@ -109,6 +110,7 @@ class Law(ABC):
     flows: ClassVar[bool] = False
     shifts: ClassVar[bool] = False
     opens_at_surfaces: ClassVar[bool] = False
+    lost: ClassVar[float] = 1.0
     elastic: ClassVar[bool] = False
     stiffness_parameters: ClassVar[tuple[str, ...]] = ("bulk_modulus", "youngs_modulus", "shear_modulus")
     viscosity_parameters: ClassVar[tuple[str, ...]] = ("viscosity", "consistency", "bulk_viscosity")

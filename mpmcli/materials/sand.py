@@ -157,6 +157,7 @@ class Sand(HenckyLaw):
     flows = True
     shifts = True
     opens_at_surfaces = True
+    lost = 0.15
 
     def __init__(self, members: tuple[SandParameters, ...], dimension: int) -> None:
         super().__init__(members, dimension)

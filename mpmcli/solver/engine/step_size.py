@@ -155,9 +155,10 @@ class StepSize:
             slowest = as_double(INFINITE)
             if run.rate[g] > 0:
                 slowest = DEFORMATION / run.rate[g]
+            damped = ti.static(min(self.scheme.damped, group.law.lost))
             for i in range(self.bodies[g]):
                 bound = ti.min(run.own[g][i], slowest)
-                group.kept[run.w * self.bodies[g] + i] = as_real(kept_share(run.dt / bound, self.scheme.damped))
+                group.kept[run.w * self.bodies[g] + i] = as_real(kept_share(run.dt / bound, damped))
 
     @ti.pyfunc
     def end(self, run: ti.template(), speed: ti.f64):

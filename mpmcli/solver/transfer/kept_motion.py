@@ -22,10 +22,15 @@ NEAR = 0.8
 
 
 def keeps_motion(scene: Scene, members: Sequence[Law]) -> bool:
-    """Return whether any body of a scene keeps a fraction of its motion, as estimated before the run."""
+    """Return whether any body of a scene keeps a fraction of its motion: by its law, by AFLIP, or in short steps.
+
+    The step is that estimated before the run.
+    """
     time, h = scene.time, scene.domain.spacing
-    if scene.solver.flip or not scene.sources:
-        return bool(scene.solver.flip)
+    if scene.solver.flip or any(law.lost < 1 for law in members):
+        return True
+    if not scene.sources:
+        return False
     of_name = {law.name: law for law in members}
     own = [own_limit(source, of_name[source.material.law], scene) for source in scene.sources]
     driven = [collider_limit(h, collider.fastest(scene.domain, time.end)) for collider in scene.colliders]
@@ -47,7 +52,7 @@ def own_limit(source: Body | Emitter, law: Law, scene: Scene) -> float:
 def kept_share(ratio: ti.template(), damped: ti.template()):
     """Return the fraction that a body keeps in a step, given the ratio of the step to the bound set by the body.
 
-    `damped` is the fraction lost in a step of its own length; 1 with APIC.
+    `damped` is the fraction lost in a step of its own length: 1 with APIC, less with AFLIP or by a law.
     """
     lost = ratio / OWN_STEP
     if ratio > NEAR * OWN_STEP:
