@@ -257,7 +257,7 @@ class BodyContact:
             change = self.stopped(grid, obstacles, w, thread, node, index, c, u, friction)
             for b in ti.static(range(d)):
                 J[b] = reduced * change[b]
-            self.loads.add(w, node, ti.static(self.pairs), 0, reduced * change.dot(u + 0.5 * change))
+            self.loads.add(w, node, ti.static(self.pairs), 0, reduced * change.dot(u + change))
         elif bodies or way < REACH * h:
             gap, n, aside, kappa, deepest = self.separation(
                 grid, obstacles, w, thread, node, index, a, c, way, facing, reduced, 2.0 / soft * dt**2
