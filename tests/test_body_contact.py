@@ -18,9 +18,9 @@ from mpmcli.scene.forces import Contact
 from mpmcli.solver.contact.layers import STICKS, Layers, require_contact_possible
 from mpmcli.solver.contact.surfaces import rest_surface
 from mpmcli.solver.engine.compiled_kind import CompiledKind
+from mpmcli.solver.engine.plan import make_plan
 from mpmcli.solver.engine.run import build_run
 from mpmcli.solver.machine.backend import Backend
-from mpmcli.solver.machine.plan import make_plan
 from mpmcli.validation.case import Setting
 from mpmcli.validation.cases.two_disks import SPEED, SeparateDisks
 

@@ -19,9 +19,9 @@ from mpmcli.output.layout import FrameLayout
 from mpmcli.output.series import write_series
 from mpmcli.scene import scene_to_toml
 from mpmcli.scene.schema import SolverSettings
+from mpmcli.solver.engine.plan import make_plan
 from mpmcli.solver.engine.run import Run, build_run
 from mpmcli.solver.frames.diagnosis import Diagnosis, UnstableRunError
-from mpmcli.solver.machine.plan import make_plan
 from mpmcli.solver.particles.sort import entry_count
 
 SAND = {"law": "sand", "density": 1600.0, "youngs_modulus": 1e7, "friction_angle": 30.0}

@@ -10,7 +10,7 @@ from mpmcli.check.scene_check import check_scene
 from mpmcli.materials.registry import laws
 from mpmcli.scene import LoadedScene, Scene
 from mpmcli.solver.engine.run import backend_for
-from mpmcli.solver.machine.plan import _table, cheapest, cost_of
+from mpmcli.solver.machine.costs import _table, cheapest, cost_of
 
 WATER = {"law": "fluid", "density": 1000.0, "bulk_modulus": 2e4}
 SAND = {"law": "sand", "density": 1600.0, "youngs_modulus": 1e7, "friction_angle": 30.0}

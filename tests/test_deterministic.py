@@ -13,11 +13,11 @@ from solver_state import masses_of, scene_of
 from test_batch import batch_of, outputs_of, same, scene_named
 
 from mpmcli.scene import BodyParticles, Scene, sample_bodies
+from mpmcli.solver.engine.plan import make_plan
 from mpmcli.solver.engine.run import Run, build_run
 from mpmcli.solver.frames.diagnosis import UnstableRunError, read_group
 from mpmcli.solver.grid.fixed_point import DENSEST, FixedSums
 from mpmcli.solver.machine.backend import Backend
-from mpmcli.solver.machine.plan import make_plan
 
 WATER = {"law": "fluid", "density": 1000.0, "bulk_modulus": 1e5}
 JELLY = {"law": "neo_hookean", "density": 900.0, "youngs_modulus": 5e4, "poissons_ratio": 0.47}

@@ -10,7 +10,7 @@ from solver_state import bodies_of, scene_of
 from mpmcli.scene import Scene, sample_bodies
 from mpmcli.solver.engine.run import build_run
 from mpmcli.solver.machine.backend import Backend
-from mpmcli.solver.machine.plan import law_objects
+from mpmcli.solver.machine.costs import law_objects
 from mpmcli.solver.transfer.kept_motion import OWN_STEP, kept_share, own_limit
 from mpmcli.validation.case import Setting
 from mpmcli.validation.cases import all_cases

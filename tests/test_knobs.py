@@ -13,10 +13,10 @@ from mpmcli.errors import InputError
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import Scene, SolverSettings, parse_scene, scene_bounds, scene_to_toml
 from mpmcli.scene.schema import USUAL_FLIP
+from mpmcli.solver.engine.plan import make_plan
 from mpmcli.solver.engine.run import build_run
 from mpmcli.solver.frames.diagnosis import read_group
 from mpmcli.solver.machine.backend import Backend
-from mpmcli.solver.machine.plan import make_plan
 from mpmcli.stability.transfer_factors import step_inertia
 
 H = 0.1

@@ -8,17 +8,18 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from solver_state import scene_of, with_colliders
+from solver_state import scene_of
 
 from mpmcli.errors import InputError
-from mpmcli.materials.registry import laws
+from mpmcli.materials.registry import laws, parameter_models
 from mpmcli.output import SegmentStore
 from mpmcli.quick_taichi import ti
-from mpmcli.scene import Scene
+from mpmcli.scene import Scene, load_scene
+from mpmcli.solver.engine.batch import Batch
+from mpmcli.solver.engine.compiled_kind import CompiledKind
+from mpmcli.solver.engine.plan import LawPlan, Plan, make_plan, require_memory
 from mpmcli.solver.engine.run import build_run
 from mpmcli.solver.machine.backend import Backend, choose_backend, has_cuda_device, start, stop_backend
-from mpmcli.solver.machine.plan import LawPlan, Plan, make_plan, require_memory
-from mpmcli.solver.particles.sort import entry_count
 
 MATERIALS = {
     "fluid": {"law": "fluid", "density": 1000.0, "bulk_modulus": 1e5},
@@ -27,43 +28,45 @@ MATERIALS = {
 }
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
+CONFIGS = Path(__file__).parents[1] / "configs"
+
+
 @pytest.mark.parametrize(
-    ("bodies", "material", "precision"),
-    [(1, "fluid", "f32"), (2, "fluid", "f64"), (1, "solid", "f64"), (2, "solid", "f32"), (1, "sand", "f32")],
+    ("name", "solver"),
+    [
+        ("dam_break_2d", {}),
+        # Deformation gradients, layers of bodies, rigid bodies, emitters with expressions, and meshes of colliders.
+        ("mixed_2d", {"precision": "f64"}),
+        ("rolling_3d", {}),
+        ("stirred_tank_2d", {"grid": "sparse"}),
+        ("fountain_2d", {}),
+        ("jelly_drop_2d", {"solids": "total"}),
+    ],
 )
-def test_the_plan_counts_every_field(
-    backend_of: Callable, dimension: int, material: str, bodies: int, precision: str
-) -> None:
-    """Bytes of state, labels and sort buffers, counted from the fields themselves; 160 at most for the 3D fluid."""
-    d, h = dimension, 0.1
-    scene = scene_of(
-        domain={"size": [8 * h] * d, "spacing": h},
-        time={"end": 1.0, "frames": 1},
-        solver={"precision": precision},
-        bodies=[
-            {
-                "name": f"body {k}",
-                "material": MATERIALS[material],
-                "shape": {"box": {"min": [4 * h * k] + [h] * (d - 1), "max": [4 * h * k + 2 * h] + [3 * h] * (d - 1)}},
-            }
-            for k in range(bodies)
-        ],
-    )
-    backend = backend_of(precision)
-    plan, run = make_plan(scene, backend), build_run(scene, backend)
-    (group,) = run.groups
-    real = {"f32": 4, "f64": 8}[precision]
-    widest = max(entry_count(field) for field in group.arrays.state)
-    state = real * sum(entry_count(field) for field in group.arrays.state)
-    assert plan.particles == run.particle_count
-    assert plan.bytes_per_particle == state + 4 * len(group.arrays.labels) + widest * real + 4 + 4
-    assert plan.nodes == run.grid.node_count
-    fine = run.grid.fine.fill.shape[0] if run.grid.fine else 0
-    assert plan.bytes_per_node * plan.nodes == real * (run.grid.nodes.n * plan.nodes + fine)
-    assert (fine > 0) == group.law.shifts
-    if (dimension, material, bodies, precision) == (3, "fluid", 1, "f32"):
-        assert plan.bytes_per_particle <= 160
+def test_the_plan_is_what_taichi_allocates(backend_of: Callable, name: str, solver: dict) -> None:
+    """Bytes of its trees of nodes, but for the alignment of each."""
+    scene = load_scene(CONFIGS / f"{name}.toml", laws=parameter_models()).scene
+    scene = scene.model_copy(update={"solver": scene.solver.model_copy(update=solver)})
+    backend = backend_of(scene.solver.precision, 2)
+    plan = make_plan(scene, backend)
+    Batch(CompiledKind.of(scene).padded(), backend)
+    runtime = ti.lang.impl.get_runtime()
+    runtime.materialize()
+    trees = range(runtime.prog.get_snode_tree_size())
+    sizes = [runtime.prog.get_snode_root(k).cell_size_bytes for k in trees]
+    assert plan.device_bytes == pytest.approx(sum(sizes), abs=8 * len(sizes) + 8)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_the_plan_has_the_bytes_of_a_particle_and_of_a_node(backend_of: Callable, dimension: int) -> None:
+    """Of a fluid in f32: x, v, C with the remainder of x, J, label; the sort; and the filling of fine cells."""
+    d, scene = dimension, scene_with("fluid", dimension=dimension)
+    plan = make_plan(scene, backend_of("f32"))
+    state, widest = 2 * d + d * (d + 1) + 1, d * (d + 1)
+    assert plan.bytes_per_particle == 4 * (state + 1 + widest + 2) <= 160
+    assert plan.particles == 4**d
+    # Momentum and mass, padded to four numbers, and the fine cells.
+    assert plan.bytes_per_node == 4 * (4 + 2**d)
 
 
 @pytest.mark.parametrize(
@@ -120,25 +123,6 @@ def scene_with(*materials: str, dimension: int = 2) -> Scene:
             for k, material in enumerate(materials)
         ],
     )
-
-
-@pytest.mark.parametrize("solids", ["updated", "total"])
-@pytest.mark.parametrize("dimension", [2, 3])
-def test_the_plan_counts_what_colliders_need(backend_of: Callable, dimension: int, solids: str) -> None:
-    """Every field, with the loads by rows of nodes in double precision, and the distances of a union on its grid."""
-    hold = {"wall": "hold"} if solids == "total" else {}
-    balls = [{"ball": {"center": [x] * dimension, "radius": 0.1}} for x in (0.5, 0.6)]
-    union = {"name": "union", "shape": balls[0] | {"add": [balls[1]]}} | hold
-    box = {"name": "box", "shape": {"box": {"min": [0.7] * dimension, "max": [0.8] * dimension}}} | hold
-    plain = scene_with("solid", dimension=dimension)
-    plain = plain.model_copy(update={"solver": plain.solver.model_copy(update={"solids": solids})})
-    scene, backend = with_colliders(plain, [union, box]), backend_of("f32", 1)
-    device = build_run(scene, backend).batch.device
-    own, taken = [*vars(device.colliders).values()], device.colliders.loads.taken
-    own += vars(device.points).values() if device.points else []
-    sizes = [4 * entry_count(field) * field.shape[0] for field in own if isinstance(field, ti.Field)]
-    more = make_plan(scene, backend).device_bytes - make_plan(plain, backend).device_bytes
-    assert more == sum(sizes) + 8 * entry_count(taken) * taken.shape[0] > 0
 
 
 def test_a_scene_of_fluid_plans_nothing_of_other_laws(backend_of: Callable) -> None:
@@ -205,7 +189,7 @@ def test_more_than_an_index_reaches_is_refused(
     monkeypatch: pytest.MonkeyPatch, fields: list[str], edge: int, cells: int, threads: int, fits: bool
 ) -> None:
     """Whatever array it is; frames and tables of the sort are the longest ones."""
-    monkeypatch.setattr("mpmcli.solver.machine.plan.MEMORY_SHARE", 1e6)
+    monkeypatch.setattr("mpmcli.solver.engine.plan.MEMORY_SHARE", 1e6)
     scene = scene_of(
         domain={"size": [float(cells)] * 3, "spacing": 1.0},
         time={"end": 1.0, "frames": 1},
@@ -264,10 +248,10 @@ class FakeDriver:
 
 def test_a_run_on_cuda_needs_the_memory_of_the_device(monkeypatch: pytest.MonkeyPatch) -> None:
     """10.1 GB on the device with its room: not of 10 GB that are free there, nor of the 1 GB that this machine has."""
-    plan = Plan((LawPlan("fluid", 10**8, {"position": 100}),), 1000, 0, 16, 16000, 1, (), "cuda")
+    plan = Plan((LawPlan("fluid", 10**8, {"position": 100}),), 1000, 0, 16, 10_100_000_000, 1, (), "cuda")
     driver = FakeDriver(10 * 10**9)
     monkeypatch.setattr("mpmcli.solver.machine.backend.ctypes.CDLL", lambda name: driver)
-    monkeypatch.setattr("mpmcli.solver.machine.plan.psutil.virtual_memory", lambda: SimpleNamespace(available=10**9))
+    monkeypatch.setattr("mpmcli.solver.engine.plan.psutil.virtual_memory", lambda: SimpleNamespace(available=10**9))
     with pytest.raises(InputError, match=r"10\.1 GB of memory on the cuda device, but at most 8 GB may be used;"):
         require_memory(plan)
     driver.free *= 2

@@ -21,10 +21,10 @@ from mpmcli.output import open_result
 from mpmcli.scene import LoadedScene, Scene, scene_to_toml
 from mpmcli.scene.primitives import unit
 from mpmcli.scene.rigid import turned_by
+from mpmcli.solver.engine.plan import make_plan
 from mpmcli.solver.engine.run import build_run
 from mpmcli.solver.frames.diagnosis import UnstableRunError
 from mpmcli.solver.machine.backend import Backend
-from mpmcli.solver.machine.plan import make_plan
 
 JELLY = {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 1e5, "poissons_ratio": 0.3}
 G, H = 9.81, 0.05

@@ -15,7 +15,7 @@ from mpmcli.solver.engine import kernel_store
 from mpmcli.solver.engine.compiled_kind import CompiledKind
 from mpmcli.solver.engine.run import build_run
 from mpmcli.solver.machine.backend import choose_backend, start, stop_backend
-from mpmcli.solver.machine.plan import FEWEST, in_steps, padded_cells, power_of_two
+from mpmcli.solver.machine.costs import FEWEST, in_steps, padded_cells, power_of_two
 
 
 @given(st.integers(1, 2**31))

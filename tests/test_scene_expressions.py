@@ -12,8 +12,8 @@ from mpmcli.errors import InputError
 from mpmcli.materials.registry import parameter_models
 from mpmcli.output import open_result
 from mpmcli.scene import highest_speed, load_scene, parse_scene, sample_bodies, scene_bounds, scene_to_toml
+from mpmcli.solver.engine.plan import make_plan
 from mpmcli.solver.machine.backend import Backend
-from mpmcli.solver.machine.plan import make_plan
 
 LAWS = parameter_models()
 SCENE = """
@@ -167,7 +167,9 @@ def test_scenes_without_expressions_plan_as_before(tmp_path):
     assert before.passes[1:3] == ("scatter fixed_corotated", "scatter fluid")
     assert after.passes[1:3] == ("scatter fixed_corotated with forces", "scatter fluid")
     solid, fluid = after.laws
-    assert solid.fields == {**before.laws[0].fields, "initial_position": 8} and fluid.fields == before.laws[1].fields
+    # Forces select the particles of their body.
+    assert solid.fields == {**before.laws[0].fields, "initial_position": 8, "body": 4}
+    assert fluid.fields == before.laws[1].fields
 
 
 def test_the_check_of_a_scene_takes_expressions(tmp_path):

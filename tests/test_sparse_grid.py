@@ -17,10 +17,10 @@ from mpmcli.frames.frame import Frame
 from mpmcli.scene import Scene, sample_bodies
 from mpmcli.scene.forces import Contact
 from mpmcli.solver.engine import batch
+from mpmcli.solver.engine.plan import make_plan, require_memory
 from mpmcli.solver.engine.run import build_run
 from mpmcli.solver.grid.sparse_grid import first_nodes_of, reach_along, tiles_reached, wants_sparse
 from mpmcli.solver.machine.backend import Backend
-from mpmcli.solver.machine.plan import make_plan, require_memory
 from mpmcli.solver.transfer.splines import PAD
 from mpmcli.stability.transfer_factors import INTERVAL
 

@@ -9,8 +9,8 @@ from solver_state import scene_of
 from taichi.lang import impl, kernel_impl
 
 from mpmcli.scene import Scene
+from mpmcli.solver.engine.plan import make_plan
 from mpmcli.solver.engine.run import Run, build_run
-from mpmcli.solver.machine.plan import make_plan
 
 WATER = {"law": "fluid", "density": 1000.0, "bulk_modulus": 1e5}
 # The modules, classes or functions that only a feature needs, and what it is called in the passes of the plan.

@@ -13,8 +13,8 @@ from mpmcli.materials.registry import parameter_models
 from mpmcli.materials.sand import BAND
 from mpmcli.materials.sand import RELAXATION as GRAINS_RELAXATION
 from mpmcli.scene import Scene, parse_scene, sample_bodies
+from mpmcli.solver.engine.plan import make_plan
 from mpmcli.solver.engine.run import build_run
-from mpmcli.solver.machine.plan import make_plan
 from mpmcli.solver.transfer.splines import PAD
 from mpmcli.stability.transfer_factors import INTERVAL
 from mpmcli.validation.case import Setting

@@ -96,7 +96,7 @@ class Ours:
         from mpmcli.solver.engine.compiled_kind import CompiledKind
         from mpmcli.solver.engine.run import Run
         from mpmcli.solver.machine.backend import choose_backend, start
-        from mpmcli.solver.machine.plan import useful_threads
+        from mpmcli.solver.machine.costs import useful_threads
 
         scene = parse_scene(data, laws=parameter_models(), source=data["title"]).scene
         backend = choose_backend(arch, threads, scene.solver.precision, compile_cache=False)

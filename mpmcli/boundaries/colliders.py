@@ -77,15 +77,6 @@ class ColliderKind:
             any(collider.wall != "hold" for collider in found),
         )
 
-    def bytes_needed(self, dimension: int, rows: int, real: int, *, at_rest: bool) -> int:
-        """Return the bytes of all fields on the device; `rows` of nodes are along the last axis, see `Colliders`."""
-        d, sums = dimension, 9 if dimension == 2 else 27
-        own = self.count * (4 * (5 + d + (self.samples > 0)) + real * (1 + 4 * d + (2 + at_rest) * d * d))
-        own += self.numbers * real + 4 * (self.count > 0)
-        loads = Loads.bytes_needed(self.count, dimension, rows)
-        points = self.points * (36 + 32 * dimension)
-        return own + loads + 8 * rows * len(self.free) * sums + points + 4 * self.samples
-
     def joined(self, other: "ColliderKind") -> "ColliderKind | None":
         """Return the kind that has room for both, or None if they need different kernels."""
         if any(getattr(self, name) != getattr(other, name) for name in ("moving", "free", "touched")):

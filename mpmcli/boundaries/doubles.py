@@ -17,7 +17,7 @@ def double_field(*shape: int, entries: tuple[int, ...] = ()) -> ti.Field:
     number with another field. On Vulkan the field therefore has its own tree. On other backends it does not, because
     the number of trees is limited.
     """
-    on_vulkan = ti.cfg.arch == ti.vulkan
+    on_vulkan = ti.lang.impl.current_cfg().arch == ti.vulkan
     within = {} if on_vulkan else {"shape": shape}
     kind = {0: ti.field, 1: ti.Vector.field, 2: ti.Matrix.field}[len(entries)]
     field = kind(*entries, ti.f64, **within)

@@ -25,11 +25,6 @@ class Loads:
         self.rows, self.width = math.prod(shape[:-1]), 3 if len(shape) == 2 else 6
         self.taken = ti.Vector.field(self.width, ti.f64 if on_cpu else float, shape=runs * capacity * self.rows)
 
-    @staticmethod
-    def bytes_needed(capacity: int, dimension: int, rows: int) -> int:
-        """Return the bytes of the loads of a run on the CPU."""
-        return 8 * capacity * rows * (3 if dimension == 2 else 6)
-
     @ti.kernel
     def clear(self, run: int):
         """Set the loads of a run to zero."""

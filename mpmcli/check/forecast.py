@@ -19,11 +19,12 @@ from mpmcli.output.store import HOLD
 from mpmcli.plain_text import size_text
 from mpmcli.scene import LoadedScene, Scene, scene_to_toml
 from mpmcli.scene.schema import SolverSettings
+from mpmcli.solver.engine.plan import Plan, make_plan, require_memory
 from mpmcli.solver.engine.run import backend_for, build_run
 from mpmcli.solver.frames.builder import POSITION_ERROR
 from mpmcli.solver.frames.diagnosis import UnstableRunError
 from mpmcli.solver.machine.backend import Backend, start
-from mpmcli.solver.machine.plan import Plan, cheapest, cost_of, make_plan, require_memory
+from mpmcli.solver.machine.costs import cheapest, cost_of
 from mpmcli.solver.transfer.kept_motion import OWN_STEP, own_limit
 from mpmcli.stability.transfer_factors import loss_per_step
 

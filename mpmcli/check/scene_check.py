@@ -18,8 +18,9 @@ from mpmcli.errors import InputError
 from mpmcli.plain_text import counted, size_text, text_table
 from mpmcli.scene import LoadedScene
 from mpmcli.scene.problem import several
+from mpmcli.solver.engine.plan import Plan, make_plan
 from mpmcli.solver.machine.backend import Backend
-from mpmcli.solver.machine.plan import Plan, make_plan, useful_threads
+from mpmcli.solver.machine.costs import useful_threads
 
 # A scene of more steps is rejected; the counts of a forecast are exact below 2^53.
 MOST_STEPS = 1e15

@@ -36,8 +36,8 @@ def check_command(
         from mpmcli.cores import available_cores
         from mpmcli.materials.registry import load_plugins
         from mpmcli.scene import load_scene
+        from mpmcli.solver.engine.plan import make_plan
         from mpmcli.solver.machine.backend import Backend
-        from mpmcli.solver.machine.plan import make_plan
 
         loaded = load_scene(path, overrides, laws=load_plugins(plugins))
         backend = Backend("cpu", threads or available_cores(), loaded.scene.solver.precision, compile_cache=True)
@@ -106,8 +106,8 @@ def info_command(
 def _scene_facts(path: Path, overrides: tuple[str, ...], plugins: tuple[Path, ...]) -> dict:
     from mpmcli.materials.registry import load_plugins
     from mpmcli.scene import load_scene
+    from mpmcli.solver.engine.plan import make_plan
     from mpmcli.solver.machine.backend import Backend
-    from mpmcli.solver.machine.plan import make_plan
 
     loaded = load_scene(path, overrides, laws=load_plugins(plugins))
     scene = loaded.scene

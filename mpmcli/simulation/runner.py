@@ -14,11 +14,12 @@ from mpmcli.scene import BodyParticles, Scene, sample_bodies, scene_to_toml
 from mpmcli.solver.contact.layers import Layers
 from mpmcli.solver.engine.batch import Batch
 from mpmcli.solver.engine.compiled_kind import CompiledKind
+from mpmcli.solver.engine.plan import make_plan, require_memory
 from mpmcli.solver.engine.run import Run, build_run, frames_of_all, suits_batch
 from mpmcli.solver.frames.diagnosis import LEFT, OUTRAN, UnstableRunError
 from mpmcli.solver.grid.sparse_grid import wants_sparse
 from mpmcli.solver.machine.backend import Arch, Backend, Optimisation, choose_backend, start, stop_backend
-from mpmcli.solver.machine.plan import make_plan, power_of_two, require_memory
+from mpmcli.solver.machine.costs import power_of_two
 
 # Takes a frame that is not kept.
 Observe = Callable[[Frame, LedgerRow], None]

@@ -10,8 +10,8 @@ import psutil
 
 from mpmcli.errors import InputError
 from mpmcli.plain_text import size_text
+from mpmcli.solver.engine.plan import Plan
 from mpmcli.solver.machine.backend import Arch
-from mpmcli.solver.machine.plan import Plan
 
 # Time reserved for the last records and the end of the process, s; and time reserved for the next check, as a multiple
 # of the longest interval between two checks.

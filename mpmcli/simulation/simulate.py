@@ -31,10 +31,10 @@ from mpmcli.simulation.stored_run import (
     write_scene,
 )
 from mpmcli.simulation.summary import RunSummary, Stopwatch
+from mpmcli.solver.engine.plan import Plan, make_plan, require_memory
 from mpmcli.solver.engine.run import Run, build_run
 from mpmcli.solver.frames.diagnosis import UnstableRunError
 from mpmcli.solver.machine.backend import Backend, is_out_of_memory, out_of_memory_sentence, start
-from mpmcli.solver.machine.plan import Plan, make_plan, require_memory
 
 
 def simulate(

@@ -19,9 +19,9 @@ from mpmcli.scene import LoadedScene, Scene
 from mpmcli.simulation.resume import Resumption, file_digests
 from mpmcli.simulation.settings import RunSettings, StopCondition
 from mpmcli.simulation.summary import RunSummary
+from mpmcli.solver.engine.plan import Plan
 from mpmcli.solver.engine.run import Run
 from mpmcli.solver.machine.backend import Backend
-from mpmcli.solver.machine.plan import Plan
 
 
 class RunContext(NamedTuple):

@@ -7,7 +7,7 @@ from pathlib import Path
 from mpmcli.check.finding import merged
 from mpmcli.check.result_check import ResultCheck
 from mpmcli.frames.ledger import LedgerRow
-from mpmcli.solver.machine.plan import Plan
+from mpmcli.solver.engine.plan import Plan
 
 
 @dataclass

@@ -116,11 +116,6 @@ class BodyContact:
         at_once = max(runs, threads) if on_cpu else runs * self.threads
         self.points = ti.field(float, shape=2 * at_once * self.share + LANES)
 
-    @staticmethod
-    def gpu_bytes(stencil: int, layers: Layers, dimension: int, real: int) -> int:
-        """Return the bytes of surface points on a GPU, for stencils with `stencil` nodes per axis."""
-        return 2 * GPU_THREADS * (2 * dimension + 2) * points_near(stencil, layers, dimension) * real
-
     def write(self, scene: Scene, run: int = 0) -> None:
         """Set the numbers of the layers of a run, and the friction between them."""
         layers, h = Layers.of(scene), scene.domain.spacing

@@ -94,12 +94,6 @@ class ColliderPoints:
         """Return the largest number of points of a run with this number of nodes: surfaces are fewer than volumes."""
         return nodes if dimension == 2 else min(nodes, nodes // 6 + 1000)
 
-    @staticmethod
-    def bytes_needed(nodes: int, rows: int, dimension: int, real: int) -> int:
-        """Return the bytes of all fields of a run."""
-        point = 8 + real * (3 * dimension + 4 + 3**dimension)
-        return 4 + 2 * real + 8 * rows + nodes * (4 + 2 * real) + ColliderPoints.room(nodes, dimension) * point
-
     def on(self, nodes: int) -> "ColliderPoints":
         """Return points for a grid with another number of nodes, and the same numbers of runs."""
         result = ColliderPoints(self.colliders, nodes, self.layers, self.density.shape[0])

@@ -256,12 +256,6 @@ class BodySurfaces:
             self.rank[g], self.slots[g] = (ti.field(int, shape=groups[g].capacity) for _ in range(2))
             self.reserved[g] = ti.field(int, shape=runs)
 
-    @staticmethod
-    def bytes_needed(nodes: int, tiles: int, particles: Sequence[int], surface: int, *, on_cpu: bool) -> int:
-        """Return the bytes for these nodes, tiles and particles per group; `surface` is the bytes per particle."""
-        own = nodes * 12 + (nodes + tiles) * 4 * len(particles) + sum(particles) * (8 + surface)
-        return own if on_cpu else own + 4 * nodes * len(particles) + 8 * sum(particles)
-
     # Where bodies may be in contact.
 
     @ti.func

@@ -190,10 +190,6 @@ class ParticleContact:
         self.following = ti.field(int, shape=group.x.shape[0])
         self.meets = ti.field(int, shape=group.x.shape[0])
 
-    @staticmethod
-    def bytes_needed(cells: Sequence[int], particles: int) -> int:
-        return 4 * (2 * math.prod(bins_along(cells)) + 2 * particles)
-
     def fields(self) -> dict[str, ti.Field]:
         return {"contact.first": self.first, "contact.following": self.following, "contact.meets": self.meets}
 

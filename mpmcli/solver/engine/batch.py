@@ -71,6 +71,7 @@ class Batch:
         steps: choice of steps on the host.
         cpu, gpu: launcher of steps on the CPU or on a GPU.
         launch_cpu: the kernel of `cpu`, compiled or stored.
+        sort_buffers: scratch memory of the sort; None if nothing is sorted.
         profile: if set to a Counter, the phases of the only run are launched one by one on the CPU, and their wall
             times, s, are added by name.
         pushes: measurement of the forces on each law, None without forces.
@@ -132,7 +133,7 @@ class Batch:
         images = MirrorImages(walls, scheme.spline.on_node, on_cpu=on_cpu)
         if deterministic:
             grid.fixed = FixedPoint(grid, groups, backend.arch)
-        self._buffers = SortBuffers(groups, runs) if sorts else None
+        self.sort_buffers = SortBuffers(groups, runs) if sorts else None
         orders = self._make_orders(groups, grid) if sorts else []
         contact = contact_between(groups, kind.bodies, grid, backend, runs)
         colliders = motion = rigid = surfaces = points = None
@@ -239,7 +240,7 @@ class Batch:
         """Return the tile order of each group."""
         kind = BlockOrder if grid.sparse else TileOrder
         sharing = self.backend.threads if self.runs == 1 else 1
-        return [kind(group, grid, self._buffers, sharing, self.runs) for group in groups]
+        return [kind(group, grid, self.sort_buffers, sharing, self.runs) for group in groups]
 
     def occupy(self, first_nodes: np.ndarray) -> None:
         """Number the tiles of a sparse grid reached by particles, given the first nodes of stencils, (n, d) int."""

@@ -7,11 +7,13 @@ from mpmcli.boundaries.colliders import ColliderKind
 from mpmcli.boundaries.walls import moving_faces, rough_faces
 from mpmcli.materials.law import Law
 from mpmcli.scene import BodyParticles, Scene
+from mpmcli.scene.sampling import count_body
 from mpmcli.scene.schema import SolverSettings
+from mpmcli.scene.sheets import sheets_of
 from mpmcli.solver.contact.layers import Layers
 from mpmcli.solver.drive.forces import Drives
 from mpmcli.solver.grid.sparse_grid import wants_sparse
-from mpmcli.solver.machine.plan import in_steps, law_objects, members_of, padded_cells, padded_colliders, power_of_two
+from mpmcli.solver.machine.costs import in_steps, law_objects, members_of, padded_cells, padded_colliders, power_of_two
 from mpmcli.solver.particles.inflow import Inflow
 from mpmcli.solver.transfer.kept_motion import keeps_motion
 from mpmcli.solver.transfer.redistribution import fine_nodes
@@ -68,8 +70,13 @@ class CompiledKind:
         return self.colliders.touched and self.layers.shares
 
     @staticmethod
-    def of(scene: Scene, particles: Sequence[BodyParticles]) -> "CompiledKind":
-        """Return the kind of a scene with these particles, one entry per source."""
+    def of(scene: Scene, particles: Sequence[BodyParticles] | None = None) -> "CompiledKind":
+        """Return the kind of a scene with these particles, one entry per source; without, they are counted."""
+        if particles is None:
+            counts = [count_body(body, i, scene.domain.spacing) for i, body in enumerate(scene.bodies)]
+            counts += [sheets_of(emitter, scene).particles for emitter in scene.emitters]
+        else:
+            counts = [len(own.position) for own in particles]
         names = scene.laws
         places = [members_of(scene, name) for name in names]
         members = law_objects(scene)
@@ -83,7 +90,7 @@ class CompiledKind:
             tuple((law.name, law.terms) for law in members),
             tuple(scene.domain.cells),
             # Rigid bodies alone have none, but fields have an entry.
-            tuple(max(1, sum(len(particles[i].position) for i in own)) for own in places),
+            tuple(max(1, sum(counts[i] for i in own)) for own in places),
             tuple(max(1, len(own)) for own in places),
             needs_filling(scene, members, Layers.of(scene)),
             fine_nodes(scene, members),

@@ -40,7 +40,7 @@ from mpmcli.solver.frames.diagnosis import require_sums_hold, stop, stop_collaps
 from mpmcli.solver.frames.recorder import FrameRecorder, moment_of, steps_of
 from mpmcli.solver.grid.sparse_grid import WANTED, first_nodes_of
 from mpmcli.solver.machine.backend import Arch, Backend, choose_backend
-from mpmcli.solver.machine.plan import cheapest, useful_threads
+from mpmcli.solver.machine.costs import cheapest, useful_threads
 from mpmcli.solver.particles.state_bounds import StateBounds, state_bounds_of
 from mpmcli.solver.transfer.particle_update import NOT_LOST, SMALLEST_J
 from mpmcli.stability.limits import Limit, collider_limit, force_limit

@@ -11,7 +11,7 @@ from mpmcli.scene import BodyParticles, Scene
 from mpmcli.solver.contact.layers import Layers
 from mpmcli.solver.contact.surfaces import rest_surface
 from mpmcli.solver.engine.batch import Batch
-from mpmcli.solver.machine.plan import members_of
+from mpmcli.solver.machine.costs import members_of
 from mpmcli.solver.particles.arrays import CONSTANTS
 from mpmcli.solver.particles.state_bounds import floor_of
 

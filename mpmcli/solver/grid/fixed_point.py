@@ -140,11 +140,6 @@ class FixedPoint:
         self.scales[run] = [of_mass, of_volume, of_cell, of_log, heaviest, per_step]
         self.forget(run)
 
-    @staticmethod
-    def bytes_needed(numbers: int, averaged: int) -> int:
-        """Return the bytes of `numbers` sums of a node and of the sums of `averaged` groups that average volumes."""
-        return 8 * (numbers + 4 * averaged)
-
     @ti.func
     def set_step(self, run: int, step: float):
         """Choose the scale of momenta, a power of two, for the stable step `step`, s."""

@@ -179,10 +179,6 @@ class Grid(LinearNodes):
         """Return the number of tiles per axis of a grid over these cells, for tiles with this edge."""
         return tuple(-(-(n + 1 + 2 * PAD) // tile) for n in cells)
 
-    @staticmethod
-    def nodes_needed(cells: Sequence[int], tile: int) -> int:
-        return math.prod(tile * n for n in Grid.tile_counts(cells, tile))
-
     @ti.func
     def clear(self, node: int):
         if ti.static(self.deterministic):

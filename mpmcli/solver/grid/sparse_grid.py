@@ -269,11 +269,6 @@ class SparseGrid(BlockNodes, Grid):
     def stored_nodes(self) -> int:
         return self._blocks * self.tile**self.dimension
 
-    @staticmethod
-    def table_bytes(tiles: int, blocks: int, dimension: int) -> int:
-        """Return the bytes of the tables for this number of tiles of the domain and of blocks."""
-        return 4 * tiles + tiles // SPAN + 4 * blocks * (2 + 2 ** (dimension - 1))
-
     def occupy(self, tiles: np.ndarray) -> None:
         """Number only these tiles, given by sorted linear indices."""
         self._occupy(np.ascontiguousarray(tiles, np.int32))

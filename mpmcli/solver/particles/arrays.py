@@ -73,6 +73,7 @@ class ParticleArrays:
     Attributes:
         law: the constitutive law.
         capacity: number of particles n.
+        bytes_by_name: bytes of each field of a particle.
         dimension: d.
         x: position relative to the origin of the domain, (n) Vector(d), m.
         v: velocity, (n) Vector(d), m/s.
@@ -155,6 +156,8 @@ class ParticleArrays:
             comes_and_goes=comes_and_goes,
             surfaced=self.surfaced,
         )
+        sizes = {float: np.dtype(self.real).itemsize, int: 4}
+        self.bytes_by_name = {name: rows * columns * sizes[kind] for name, (kind, rows, columns) in wanted.items()}
         made = {name: _field(count, *shape) for name, shape in wanted.items()}
         self.x, self.v, self.gradient = made["position"], made["velocity"], made["velocity_gradient"]
         self.displacement_gradient, self.J_minus_1 = made.get("deformation_gradient"), made.get("volume_ratio")

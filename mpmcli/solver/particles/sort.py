@@ -88,11 +88,6 @@ class TileOrder:
         self.span_sum = ti.field(int, shape=runs * self.spans)
         self.work = ti.field(int, shape=(self.colours, threads + 1))
 
-    @staticmethod
-    def bytes_needed(tiles: int, threads: int) -> int:
-        """Return the bytes of the tables of one group for this number of tiles."""
-        return 4 * tiles * (threads + 1)
-
     @ti.func
     def first_node_of(self, p: int):
         base, _ = self.grid.scheme.spline.stencil(self.group.on_grid(p), self.grid.inverse_spacing)
