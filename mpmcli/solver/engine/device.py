@@ -85,20 +85,7 @@ class Device:
     @property
     def phases(self) -> tuple[Phase, ...]:
         """The phases of a step."""
-        return step_phases(
-            [group.law for group in self.groups],
-            [group.averages for group in self.groups],
-            [group.levels for group in self.groups],
-            contact=self.nodes.needs_contact and (self.contact is None or self.contact.surfaces.shares),
-            friction=self.nodes.needs_friction,
-            deterministic=self.grid.deterministic,
-            loads=self.grid.deterministic and self.nodes.collides,
-            shifts=self.grid.dimension if self.grid.fine else 0,
-            separates=self.contact is not None,
-            serial=self.stencils is not None,
-            rigid=self.rigid is not None,
-            points=self.points is not None,
-        )
+        return step_phases(self.groups, self.nodes, self.contact, serial=self.stencils is not None)
 
 
 def _changed(thing: object, **attributes: object) -> object:

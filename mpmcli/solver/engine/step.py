@@ -20,10 +20,13 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from mpmcli.boundaries.rigid_bodies import ROUNDS
-from mpmcli.materials.law import Law
 from mpmcli.quick_taichi import ti
 from mpmcli.solver.contact import collider_points as touch
+from mpmcli.solver.contact.body_contact import BodyContact
+from mpmcli.solver.grid.grid import Grid
+from mpmcli.solver.particles.arrays import ParticleArrays
 from mpmcli.solver.transfer import redistribution as by
+from mpmcli.solver.transfer.node_update import NodeUpdate
 
 
 @dataclass(frozen=True)
@@ -60,57 +63,39 @@ class Phase:
 
 
 def step_phases(
-    laws: Sequence[Law],
-    averages: Sequence[bool],
-    levels: Sequence[bool],
-    *,
-    contact: bool,
-    friction: bool,
-    deterministic: bool = False,
-    loads: bool = False,
-    shifts: int = 0,
-    separates: bool = False,
-    serial: bool = True,
-    rigid: bool = False,
-    points: bool = False,
+    arrays: Sequence[ParticleArrays], nodes: NodeUpdate, contact: BodyContact | None, *, serial: bool
 ) -> tuple[Phase, ...]:
     """Return the phases of a step; consecutive ones with the same name that do not add to nodes may run concurrently.
 
     The phase "meet" takes two turns per round: over points, and over rigid bodies.
 
     Args:
-        laws: the laws, one per group.
-        averages: for each law, whether the changes of volume of its particles are averaged over cells.
-        levels: for each law, whether its particles take the average.
-        contact: whether material can separate from any wall.
-        friction: whether any wall has friction.
-        deterministic: whether P2G is in fixed point.
-        loads: whether loads on colliders are summed in a phase of their own.
-        shifts: the dimension if particles are shifted, else 0.
-        separates: whether bodies have velocity fields of their own, with contact at their surfaces.
+        arrays: the particles of each law.
+        nodes: the update of nodes.
+        contact: contact of bodies with velocity fields of their own, or None.
         serial: whether one thread lists surface particles, as on a CPU.
-        rigid: whether any collider moves freely.
-        points: whether colliders act at points of their surfaces.
     """
-    groups = range(len(laws))
+    groups, grid = tuple(enumerate(arrays)), nodes.grid
+    rigid, points, separates = nodes.couples, nodes.touches, contact is not None
+    leaves = nodes.needs_contact and (contact is None or contact.surfaces.shares)
     return (
-        *(shift_phases(laws, shifts, deterministic=deterministic) if shifts else ()),
+        *(shift_phases(arrays, grid) if grid.fine else ()),
         Phase("clear", "nodes"),
-        *(Phase("average", "particles", g, adds=True) for g in groups if averages[g]),
-        *(Phase("scatter", "particles", g, adds=True) for g in groups),
-        *[Phase("to_float", "nodes")] * deterministic,
+        *(Phase("average", "particles", g, adds=True) for g, group in groups if group.averages),
+        *(Phase("scatter", "particles", g, adds=True) for g, _ in groups),
+        *[Phase("to_float", "nodes")] * grid.deterministic,
         *[Phase("fill_solids", "nodes", body=touch.fill_solids, wanted=touch.near_row)]
-        * (points and any(law.relaxes for law in laws)),
-        *(Phase("relax", "particles", g) for g in groups if laws[g].relaxes or levels[g]),
+        * (points and any(group.law.relaxes for _, group in groups)),
+        *(Phase("relax", "particles", g) for g, group in groups if group.law.relaxes or group.levels),
         *[Phase("find_bodies", "nodes")] * separates,
-        *(Phase("show_surface", "particles", g) for g in groups if separates and laws[g].surfaced),
+        *(Phase("show_surface", "particles", g) for g, group in groups if group.surfaced),
         *[Phase("link_surfaces", "particles")] * (separates and serial),
         *[Phase("reserve", "nodes")] * (separates and not serial),
-        *(Phase("put", "particles", g) for g in groups if separates and not serial and laws[g].surfaced),
+        *(Phase("put", "particles", g) for g, group in groups if group.surfaced and not serial),
         *[Phase("chain", "nodes")] * (separates and not serial),
         *[Phase("exchange", "threads")] * separates,
-        *[Phase("find_contact", "planes")] * contact,
-        *[Phase("find_friction", "planes")] * friction,
+        *[Phase("find_contact", "planes")] * leaves,
+        *[Phase("find_friction", "planes")] * nodes.needs_friction,
         Phase("update", "nodes"),
         *[Phase("find_points", "nodes", body=touch.find_points, wanted=touch.new_row)] * points,
         *[Phase("spread_points", "nodes", body=touch.spread_points, wanted=touch.marked_row)] * points,
@@ -118,16 +103,17 @@ def step_phases(
         *[Phase("meet", "rows", turns=2 * ROUNDS, body=touch.meet_points, wanted=touch.busy_row)] * rigid,
         *[Phase("settle_points", "nodes", body=touch.settle_points, wanted=touch.busy_row)] * rigid,
         *[Phase("push_points", "nodes", body=touch.push_points, wanted=touch.last_row)] * points,
-        *[Phase("add_loads", "loads")] * loads,
+        # Sums in fixed point leave the loads on colliders to a phase of their own.
+        *[Phase("add_loads", "loads")] * (grid.deterministic and nodes.collides),
         *[Phase("move_bodies", "bodies")] * rigid,
-        *(Phase("advance", "particles", g) for g in groups),
+        *(Phase("advance", "particles", g) for g, _ in groups),
     )
 
 
-def shift_phases(laws: Sequence[Law], dimension: int, *, deterministic: bool) -> tuple[Phase, ...]:
+def shift_phases(arrays: Sequence[ParticleArrays], grid: Grid) -> tuple[Phase, ...]:
     """Return the phases that shift the particles of laws with `Law.shifts`."""
-    groups = range(len(laws))
-    flowing = [g for g in groups if laws[g].shifts]
+    groups, dimension, deterministic = range(len(arrays)), grid.dimension, grid.deterministic
+    flowing = [g for g in groups if arrays[g].law.shifts]
     phases = (
         Phase("clear_fine", "nodes", body=by.clear_fine),
         *(Phase("fill_fine", "particles", g, True, 1, by.fill_fine, by.fill_range) for g in groups),
