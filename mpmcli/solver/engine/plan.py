@@ -122,7 +122,7 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
     )
     rooms = [group.capacity for group in device.groups]
     buffers = [field for field in vars(batch.sort_buffers).values() if isinstance(field, DryField)]
-    shown = sum(rooms) * frame_columns(scene, members)
+    shown = sum(rooms) * _frame_columns(scene, members)
     return Plan(
         laws=laws,
         nodes=grid.node_count,
@@ -130,7 +130,7 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
         bytes_per_node=sum(field.bytes for field in _fields_by_node(grid)) // grid.node_count,
         device_bytes=sum(field.bytes for field in made),
         host_bytes=host_bytes_of(scene, members, sum(law.particles for law in laws), real, on_cpu=backend.on_cpu),
-        passes=passes_of(device),
+        passes=_passes_of(device),
         arch=backend.arch,
         sparse=grid.sparse,
         entries=max(shown, *(field.length for field in made)),
@@ -145,7 +145,7 @@ def _fields_by_node(grid: Grid) -> list[DryField]:
     return [field for field in found if field is not None]
 
 
-def passes_of(device: Device) -> tuple[str, ...]:
+def _passes_of(device: Device) -> tuple[str, ...]:
     """Return the loops of one step in words."""
     words = WORDS | {"update": "update grid" + " with colliders" * device.nodes.collides}
     groups = device.groups
@@ -166,7 +166,7 @@ def host_bytes_of(scene: Scene, members: Sequence[Law], particles: int, real: in
     d = scene.dimension
     # Double precision: positions, and if they depend on the position, velocities, their gradients and deformations.
     start = 8 * (d + any(map(has_expressions, scene.bodies)) * (d + 2 * d * d))
-    columns = frame_columns(scene, members)
+    columns = _frame_columns(scene, members)
     widths = {"velocity": 0, "initial_position": d, "affine": d * d, "deformation_gradient": d * d, "stress": 9}
     fields = sum(widths.get(name, 1) for name in scene.output.fields)
     # The frame: positions, velocities and fields.
@@ -183,7 +183,7 @@ def host_bytes_of(scene: Scene, members: Sequence[Law], particles: int, real: in
     return particles * max(start, real * columns + frame)
 
 
-def frame_columns(scene: Scene, members: Sequence[Law]) -> int:
+def _frame_columns(scene: Scene, members: Sequence[Law]) -> int:
     """Return how many numbers per particle a frame is built from."""
     internal = max(len(law.internal) for law in members)
     return FrameColumns(scene.dimension, internal, scene.output.fields, comes_and_goes=scene.comes_and_goes).count
