@@ -130,6 +130,24 @@ def test_points_that_do_not_act_are_counted_in_their_step(backend_of: Callable) 
     assert min(((frame.position - middle) @ normal).min() for frame in frames) > 0
 
 
+@pytest.mark.parametrize(("thickness", "above"), [(0.5, 0.15), (1.0, 0.15), (1.0, 0.4)])
+def test_a_sheet_of_water_flies_past_an_edge(backend_of: Callable, thickness: float, above: float) -> None:
+    """Along a face and past its end, without gravity, at its speed: nothing has drifted into the face behind the edge.
+
+    The points there see less than a thousandth of the mass of full nodes.
+    """
+    face, top, speed = 8.15 * H, (8 + above) * H, 5.0
+    sheet = {"min": [face, 2 * H], "max": [face + thickness * H, 6 * H]}
+    asked = scene_of(
+        domain={"size": [20 * H, 20 * H], "spacing": H, "gravity": [0.0, 0.0], "walls": "separate"},
+        time={"end": 0.12, "frames": 3},
+        bodies=[{"name": "sheet", "material": WATER, "velocity": [0.0, speed], "shape": {"box": sheet}}],
+        colliders=[{"name": "post", "shape": {"box": {"min": [4 * H, -H], "max": [face, top]}}}],
+    )
+    for frame, _ in build_run(asked, backend_of("f32", 1)).frames():
+        assert frame.velocity == pytest.approx(np.tile([0.0, speed], (len(frame.velocity), 1)), abs=1e-3)
+
+
 @pytest.mark.parametrize("degrees", [10, 17])
 def test_no_spray_enters_a_slope_beside_a_wall(backend_of: Callable, degrees: float) -> None:
     """Spray that runs down into the corner stays on the slope: nodes on the wall have points on it, at any slope.

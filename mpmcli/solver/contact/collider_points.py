@@ -343,10 +343,9 @@ class ColliderPoints:
                     outside += free
                 filled = ti.select(free < 0.0, -1.0, 1.0) * mass / ti.max(share, LEAST)
             self.weights[p * self.stencil + c] = filled
-        full, over = ti.min(most, self.density[self.run]), 0.0
-        if full > 0.0:
-            over = held / ti.max(outer / ti.max(outside, LEAST), full) - room
-        return full, over
+        # Where the outside holds only spray, `most` is no measure of what fits.
+        lightest = self.density[self.run]
+        return ti.min(most, lightest), held / ti.max(outer / ti.max(outside, LEAST), lightest) - room
 
     # Sums.
 

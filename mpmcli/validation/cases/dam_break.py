@@ -240,13 +240,15 @@ class DamBreakObstacle(Case):
         # Forces are means since the previous frame.
         middle = time - END / (2 * (len(time) - 1))
         face = (UPPER[1] - LOWER[1]) * UPPER[2]
+        # The force stays near its peak for 0.1 s, where frames differ by a fifth: a mean of three has a definite peak.
+        smooth = np.convolve(force, np.ones(3) / 3, "same")
         return {
             "height error": float(np.mean(errors)),
             **{f"height error {name}": error for name, error in zip(gauges, errors, strict=True)},
             **{f"arrival {name}": arrival(time, curves[name]) - gauges[name].arrival for name in ("H3", "H2")},
             "impact": impact(time, np.array(fronts)) - IMPACT,
             "first force": arrival(middle, force, force.max() / 10) - IMPACT,
-            "peak": float(middle[np.argmax(force)]) - IMPACT,
+            "peak": float(middle[np.argmax(smooth)]) - IMPACT,
             "largest force": float(force.max()) / (DENSITY * SPEED**2 / 2 * face),
             "depth in the box": deepest * n / WIDTH,
         }
