@@ -15,10 +15,11 @@ from mpmcli.errors import InputError
 from mpmcli.frames.frame import Frame
 from mpmcli.scene import Scene, sample_bodies
 from mpmcli.scene.forces import Contact
-from mpmcli.solver.contact.layers import STICKS, Layers, require_contact_possible
+from mpmcli.solver.contact.layers import STICKS, Layers
 from mpmcli.solver.contact.surfaces import rest_surface
 from mpmcli.solver.engine.compiled_kind import CompiledKind
 from mpmcli.solver.engine.plan import make_plan
+from mpmcli.solver.engine.refusals import require_possible
 from mpmcli.solver.engine.run import build_run
 from mpmcli.solver.machine.backend import Backend
 from mpmcli.validation.case import Setting
@@ -98,7 +99,7 @@ def test_elastic_bodies_separate_unless_one_is_alone_or_the_solver_has_one_field
     ):
         asked = scene([a, b], contact={}, **tables)
         assert asked.one_field == reason and not Layers.of(asked).separate
-        require_contact_possible(asked, Backend("cpu", 1, "f32", False))
+        require_possible(asked, Backend("cpu", 1, "f32", False))
 
 
 def test_the_plan_counts_layers() -> None:
@@ -174,7 +175,7 @@ def test_pairs_that_cannot_be_are_one_sentence(pairs: list, said: str) -> None:
 def test_what_has_one_velocity_field_is_refused(tables: dict, arch: str, reason: str) -> None:
     two = scene([body("a", [2, 2], [8, 8]), body("b", [12, 2], [18, 8])], **tables)
     with pytest.raises(InputError, match=f"separating bodies are not available {reason}; change this, or set "):
-        require_contact_possible(two, Backend(arch, 1, "f32", False))
+        require_possible(two, Backend(arch, 1, "f32", False))
 
 
 # The exchange at nodes.

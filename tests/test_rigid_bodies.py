@@ -132,6 +132,20 @@ def test_what_they_are_not_available_with_is_refused(tables: dict, reason: str) 
         make_plan(asked, Backend("cpu", 1, "f32", False))
 
 
+def test_all_that_a_scene_cannot_combine_is_said_at_once() -> None:
+    moved = {"walls": "stick", "wall_velocity": {"y_min": [1.0, 0.0]}}
+    body = {"shape": box([0.6, 0.4], [0.8, 0.6])}
+    asked = scene(2, 0.0, body, domain=moved, contact={"default": "separate"}, solver={"grid": "sparse"})
+    with pytest.raises(InputError) as raised:
+        make_plan(asked, Backend("vulkan", 1, "f32", False))
+    assert [line.split(" are not available ")[0] for line in str(raised.value).splitlines()] == [
+        "separating bodies",
+        "colliders with a density",
+        "colliders with a density",
+        "sparse grids",
+    ]
+
+
 def test_check_sees_what_is_thin_or_begins_inside() -> None:
     """Of a wall, of another one; what touches is no finding. One elastic body has no material on the other side."""
     water = {"material": {"law": "fluid", "density": 1000.0, "bulk_modulus": 1e6}}

@@ -9,9 +9,8 @@ from hypothesis import strategies as st
 from solver_state import scene_of
 
 from mpmcli.errors import InputError
-from mpmcli.scene import Scene, sample_bodies
-from mpmcli.solver.engine.batch import Batch
-from mpmcli.solver.engine.compiled_kind import CompiledKind
+from mpmcli.scene import Scene
+from mpmcli.solver.engine.plan import make_plan
 from mpmcli.solver.machine.backend import Backend
 
 BALL = {"ball": {"center": [0.5, 0.5], "radius": 0.1}}
@@ -123,8 +122,8 @@ def test_the_speed_counts_that_of_turning_and_of_a_pivot_that_moves() -> None:
 
 def test_a_device_without_double_precision_moves_no_collider() -> None:
     moving = scene({"velocity": [1.0, 0.0]})
-    with pytest.raises(InputError, match="moving colliders need double precision, which --arch metal lacks"):
-        Batch(CompiledKind.of(moving, sample_bodies(moving)), Backend("metal", 1, "f32", True))
+    with pytest.raises(InputError, match="moving colliders are not available with --arch metal; use --arch cpu"):
+        make_plan(moving, Backend("metal", 1, "f32", True))
 
 
 def test_colliders_need_names_of_their_own_and_solids_that_know_them() -> None:

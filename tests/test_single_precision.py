@@ -65,5 +65,5 @@ def test_no_kernel_counts_in_double_precision(name: str) -> None:
 
 def test_colliders_that_move_are_refused(backend_of: Callable) -> None:
     backend = in_single_precision(backend_of("f32", 1))
-    with pytest.raises(InputError, match="moving colliders need double precision"):
+    with pytest.raises(InputError, match="moving colliders are not available"):
         build_run(scene_named("colliders"), backend)

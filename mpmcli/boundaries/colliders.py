@@ -5,13 +5,14 @@ the forms that occur (docs/theory.md, 3.8).
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import MutableMapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from mpmcli.boundaries.distances import DISTANCES, BoxDistance, GridDistance, samples_of
 from mpmcli.boundaries.doubles import double_field
+from mpmcli.boundaries.feature import Feature
 from mpmcli.boundaries.loads import Loads
 from mpmcli.boundaries.rows import Rows
 from mpmcli.quick_taichi import ti
@@ -132,7 +133,7 @@ def reach_of(collider: Collider, h: float) -> np.ndarray:
 
 
 @ti.data_oriented
-class Colliders:
+class Colliders(Feature):
     """The colliders of some runs.
 
     Attributes:
@@ -226,9 +227,22 @@ class Colliders:
         self._rows.write_all(run * self.capacity, rows)
         self.loads.clear(run)
 
-    def count_of(self, run: int) -> int:
-        """Return the number of colliders of a run."""
-        return self._counts[run]
+    def saved(self) -> dict[str, ti.Field]:
+        return {"colliders.taken": self.loads.taken}
+
+    @property
+    def noted(self) -> int:
+        return self.capacity * self.loads.width
+
+    @ti.func
+    def note(self, run: int, frame: int, column: int, frame_stats: ti.template()):
+        self.loads.note(run, frame, column, frame_stats)
+
+    def read(self, run: int) -> np.ndarray:
+        return self.loads.read(run).ravel()
+
+    def name(self, values: np.ndarray, run: int, found: MutableMapping[str, np.ndarray]) -> None:
+        found["collider"] = values.reshape(len(values), self.capacity, -1)[:, : self._counts[run]]
 
     @ti.kernel
     def _write_numbers(self, first: int, numbers: ti.types.ndarray(ndim=1)):
@@ -447,7 +461,7 @@ class Colliders:
 
 
 @ti.data_oriented
-class ColliderMotion:
+class ColliderMotion(Feature):
     """The moving colliders of some runs: their poses and velocities in a step.
 
     A collider has the pose of the start of a step. Its points have the mean velocity of the step, so that material that
@@ -477,6 +491,9 @@ class ColliderMotion:
             rates = [float(evaluate(tree, {"t": 0.0})) for tree in motion.rates]
             rows.append(([*place, motion.angle], motion.axis, rates))
         self._rows.write_all(run * len(self.moving), rows)
+
+    def saved(self) -> dict[str, ti.Field]:
+        return {"colliders.pose": self.pose}
 
     @ti.func
     def advance(self, run: int, dt: ti.f64):

@@ -31,15 +31,15 @@ class Loads:
         for q in range(self.rows * self.capacity):
             self.taken[run * self.rows * self.capacity + q] = ti.Vector.zero(float, self.width)
 
-    def read(self, run: int, count: int) -> np.ndarray:
-        """Return the loads of the first `count` receivers of a run, (count, width), and set all to zero."""
+    def read(self, run: int) -> np.ndarray:
+        """Return the loads of the receivers of a run, (capacity, width), and set all to zero."""
         size = self.rows * self.capacity
         taken = self.taken.to_numpy()[run * size : (run + 1) * size].astype(np.float64)
         self.clear(run)
-        return np.cumsum(taken.reshape(self.rows, self.capacity, -1), axis=0)[-1][:count]
+        return np.cumsum(taken.reshape(self.rows, self.capacity, -1), axis=0)[-1]
 
     @ti.func
-    def sum_up(self, run: int, frame: int, column: int, frame_stats: ti.template()):
+    def note(self, run: int, frame: int, column: int, frame_stats: ti.template()):
         """Store the loads of a run in frame_stats[run, frame], from `column` on, and set them to zero."""
         for k in range(self.capacity):
             total = ti.Vector.zero(ti.f64, self.width)

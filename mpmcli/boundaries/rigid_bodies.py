@@ -6,6 +6,8 @@ the rows in order. Converged or not, the body receives exactly the impulse that 
 to single precision, because many nodes add to a row at once.
 """
 
+from collections.abc import MutableMapping
+
 import numpy as np
 
 from mpmcli.boundaries.colliders import Colliders
@@ -36,33 +38,38 @@ class RigidBodies(RigidMotion):
         self.sums = double_field(n * colliders.loads.rows, self.entries)
         self.total = double_field(n, self.entries)
 
+    @property
+    def noted(self) -> int:
+        return self.count * (self.width + 2 * self.loads)
+
     @ti.func
-    def sum_up(self, run: int, frame: int, column: int, frame_stats: ti.template()):
-        """Store poses and rates of a frame, from `column` on; add the loads of the bodies to the columns before it."""
-        loads, room = ti.static((self.loads, self.colliders.capacity))
+    def note(self, run: int, frame: int, column: int, frame_stats: ti.template()):
+        """Store pose, rate, and loads since the last frame, of each body."""
+        loads, wide = ti.static((self.loads, self.width + self.loads))
         for j in range(self.count):
             b = run * self.count + j
             self.take_rate(b)
-            own, taken = column + j * ti.static(self.width + loads), column + (self.numbers[j] - room) * loads
+            own = column + j * ti.static(wide + loads)
             for a in range(self.width):
                 frame_stats[run, frame, own + a] = self.pose[b, a]
             for a in range(loads):
                 frame_stats[run, frame, own + ti.static(self.width) + a] = self.rate[b, a]
-                frame_stats[run, frame, taken + a] += self.booked[b, a]
+                frame_stats[run, frame, own + wide + a] = self.booked[b, a]
                 self.booked[b, a] = ti.cast(0, ti.f64)
 
-    def read(self, run: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return poses and rates of the bodies of a run, (count, k), and their loads since the last frame.
-
-        The loads are set to zero. On the CPU the kernel does this, see `sum_up`.
-        """
+    def read(self, run: int) -> np.ndarray:
         own = slice(run * self.count, (run + 1) * self.count)
         momentum, mobility, booked = (one.to_numpy() for one in (self.momentum, self.mobility, self.booked))
         rates = (mobility[own] @ momentum[own][..., None])[..., 0]
         taken = booked[own].copy()
         booked[own] = 0.0
         self.booked.from_numpy(booked)
-        return np.hstack([self.pose.to_numpy()[own], rates]), taken
+        return np.hstack([self.pose.to_numpy()[own], rates, taken]).ravel()
+
+    def name(self, values: np.ndarray, _run: int, found: MutableMapping[str, np.ndarray]) -> None:
+        own = values.reshape(len(values), self.count, -1)
+        found["rigid"] = own[..., : -self.loads]
+        found["collider"][:, list(self.free)] += own[..., -self.loads :]
 
     # Rounds.
 

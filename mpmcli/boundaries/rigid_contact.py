@@ -10,6 +10,7 @@ import numpy as np
 
 from mpmcli.boundaries.colliders import HOLD, STICK, contact_points
 from mpmcli.boundaries.doubles import double_field
+from mpmcli.boundaries.feature import Feature
 from mpmcli.boundaries.rigid_bodies import RigidBodies
 from mpmcli.boundaries.rows import Rows
 from mpmcli.quick_taichi import ti
@@ -31,7 +32,7 @@ LATER = -1.0
 
 
 @ti.data_oriented
-class RigidContact:
+class RigidContact(Feature):
     """Contact of the bodies of some runs; `faces` are the conditions of the walls, `capacity` the points of a run."""
 
     def __init__(self, bodies: RigidBodies, faces: tuple[tuple[str, str], ...], runs: int) -> None:
@@ -79,6 +80,9 @@ class RigidContact:
         for a, side in self.walls:
             faces[a, side] = STUCK if words[a][side] == "stick" else frictions[a][side]
         self._runs.write(run, [len(points)], [faces])
+
+    def saved(self) -> dict[str, ti.Field]:
+        return {"rigid.other": self.other, "rigid.impulse": self.impulse}
 
     @ti.func
     def resolve(self, run: int, dt: ti.f64, extent: ti.template(), colliders: ti.template()):

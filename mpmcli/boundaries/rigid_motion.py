@@ -11,6 +11,7 @@ import numpy as np
 
 from mpmcli.boundaries.colliders import Colliders
 from mpmcli.boundaries.doubles import double_field, sin_cos
+from mpmcli.boundaries.feature import Feature
 from mpmcli.boundaries.rows import Rows
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
@@ -23,7 +24,7 @@ FAR = 1e30
 
 
 @ti.data_oriented
-class RigidMotion:
+class RigidMotion(Feature):
     """The free colliders of some runs.
 
     Attributes:
@@ -101,6 +102,15 @@ class RigidMotion:
             row += [hinge, (joint.strength or math.inf) if driven else 0.0]
             rows.append(row + ([np.vstack([axes, found])] if d == 3 else []))
         self._rows.write_all(run * self.count, rows)
+
+    def saved(self) -> dict[str, ti.Field]:
+        names = ("pose", "mobility", "ways", "weight", "momentum", "booked", "support")
+        return {f"rigid.{name}": getattr(self, name) for name in names}
+
+    def broken(self, run: int) -> int | None:
+        poses = self.pose.to_numpy()[run * self.count :][: self.count]
+        found = np.flatnonzero(~(np.abs(poses) < FAR).all(axis=1))
+        return self.free[found[0]] if len(found) else None
 
     def fastest(self, run: int) -> float:
         """Return the bound of `move` on the speed of the bodies of a run now, m/s."""

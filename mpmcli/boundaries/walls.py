@@ -8,6 +8,7 @@ import math
 from collections.abc import Sequence
 from copy import copy
 
+from mpmcli.boundaries.feature import Feature
 from mpmcli.boundaries.rows import Rows
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
@@ -31,7 +32,7 @@ def moving_faces(scene: Scene) -> tuple[tuple[int, int], ...]:
 
 
 @ti.data_oriented
-class MovingFaces:
+class MovingFaces(Feature):
     """Velocities of the faces that move. They are data, so that runs that differ in them share kernels.
 
     Attributes:
@@ -69,7 +70,7 @@ def rough_faces(scene: Scene) -> tuple[tuple[int, int], ...]:
 
 
 @ti.data_oriented
-class RoughFaces:
+class RoughFaces(Feature):
     """Coefficients of friction of the rough faces. They are data, so that runs that differ in them share kernels.
 
     Attributes:

@@ -9,11 +9,12 @@ a spring on the gap. All impulses are implicit in the velocity of the node, with
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import MutableMapping, Sequence
 
 import numpy as np
 
 from mpmcli.boundaries.colliders import DEEP
+from mpmcli.boundaries.feature import Feature
 from mpmcli.boundaries.loads import Loads
 from mpmcli.boundaries.rows import Rows
 from mpmcli.materials.elementary import exp, log
@@ -76,7 +77,7 @@ WORK = "contact_work"
 
 
 @ti.data_oriented
-class BodyContact:
+class BodyContact(Feature):
     """Contact of the bodies of a batch with each other and with obstacles; w is the index of a run.
 
     Attributes:
@@ -135,19 +136,30 @@ class BodyContact:
                 bands[layer] = distance
         self._rows.write(run * self.layers, np.hstack([rows, layers.frictions(scene)]), bands)
 
-    def read(self, run: int) -> dict[str, np.ndarray]:
-        """Return the loads and the extremes of a run since the last frame, on a GPU, and reset them."""
+    def saved(self) -> dict[str, ti.Field]:
+        own = {"contact.taken": self.loads.taken, "contact.extremes": self.extremes}
+        return {"layers.low": self.surfaces.low, "layers.high": self.surfaces.high} | own
+
+    @property
+    def noted(self) -> int:
+        return self.loads.capacity * self.loads.width + len(EXTREMES)
+
+    def read(self, run: int) -> np.ndarray:
         extremes = self.extremes.to_numpy()
-        loads = self.loads.read(run, self.pairs + 1)
-        found = {"contact": loads[:-1], WORK: loads[-1, 0]} | dict(zip(EXTREMES, extremes[run], strict=True))
+        found = np.append(self.loads.read(run), extremes[run])
         extremes[run] = 0.0
         self.extremes.from_numpy(extremes)
         return found
 
+    def name(self, values: np.ndarray, _run: int, found: MutableMapping[str, np.ndarray]) -> None:
+        loads, extremes = np.split(values, [-len(EXTREMES)], axis=1)
+        loads = loads.reshape(len(values), -1, self.loads.width)
+        found |= {"contact": loads[:, :-1], WORK: loads[:, -1, 0], **dict(zip(EXTREMES, extremes.T, strict=True))}
+
     @ti.func
-    def sum_up(self, run: int, frame: int, column: int, frame_stats: ti.template()):
-        """Store the loads and then the extremes of a frame, from a column on, and reset them."""
-        self.loads.sum_up(run, frame, column, frame_stats)
+    def note(self, run: int, frame: int, column: int, frame_stats: ti.template()):
+        """Store the loads and then the extremes."""
+        self.loads.note(run, frame, column, frame_stats)
         for k in ti.static(range(len(EXTREMES))):
             frame_stats[run, frame, column + ti.static(self.loads.capacity * self.loads.width) + k] = self.extremes[
                 run, k

@@ -14,6 +14,7 @@ import math
 from copy import copy
 
 from mpmcli.boundaries.colliders import HELD, HOLD, LOOSE, PRESSED, SEPARATE, STICK, Colliders
+from mpmcli.boundaries.feature import Feature
 from mpmcli.materials.law import StateBound
 from mpmcli.materials.registry import laws
 from mpmcli.quick_taichi import ti
@@ -48,7 +49,7 @@ def smooth(t: float):
 
 
 @ti.data_oriented
-class ColliderPoints:
+class ColliderPoints(Feature):
     """The points of the surfaces of colliders that material touches in a step, in the shared layer of some runs.
 
     Attributes:

@@ -5,12 +5,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from mpmcli.errors import InputError
 from mpmcli.scene import Scene
 from mpmcli.scene.sampling import points_per_cell
-from mpmcli.scene.schema import MOST_FIELDS
-from mpmcli.solver.grid.sparse_grid import wants_sparse
-from mpmcli.solver.machine.backend import Backend
 
 # Used instead of a coefficient of friction: both layers have the same velocity at common nodes.
 STICKS = -1.0
@@ -74,25 +70,3 @@ class Layers:
 def touched(scene: Scene, layers: Layers) -> bool:
     """Return whether colliders act at points of their surfaces: some do not hold, and bodies share a layer."""
     return layers.shares and any(collider.wall != "hold" for collider in scene.colliders)
-
-
-def require_contact_possible(scene: Scene, backend: Backend) -> None:
-    """Raise an error if bodies of a scene separate and its grid or backend supports only one velocity field.
-
-    Raises:
-        InputError: names the property of the scene or the backend with which contact is not available.
-    """
-    layers, solver = Layers.of(scene), scene.solver
-    reasons = {
-        f"with --arch {backend.arch}": not backend.doubles,
-        "with solver.deterministic = true on a GPU": solver.deterministic and not backend.on_cpu,
-        'with solver.solids = "total"': solver.solids == "total",
-        'with solver.grid = "sparse"': wants_sparse(scene),
-        f"for more than {MOST_FIELDS} bodies": layers.count > MOST_FIELDS,
-    }
-    for reason, applies in reasons.items():
-        if applies and layers.separate:
-            raise InputError(
-                f'separating bodies are not available {reason}; change this, or set contact.default = "stick" and omit '
-                "the pairs."
-            )

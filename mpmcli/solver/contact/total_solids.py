@@ -10,11 +10,10 @@ between two particles, so that momentum and angular momentum are conserved (docs
 import math
 from collections.abc import Sequence
 
-from mpmcli.errors import InputError
+from mpmcli.boundaries.feature import Feature
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import SolverSettings
 from mpmcli.solver.grid.grid import Grid
-from mpmcli.solver.machine.backend import Backend
 from mpmcli.solver.particles.arrays import MASS, VOLUME, ParticleArrays
 
 # A body that starts within this distance, cells, of a slipping or sticking wall is permanently held by that wall.
@@ -152,16 +151,10 @@ EMPTY, SEVERAL = -1, -2
 
 
 def contact_between(
-    groups: Sequence[ParticleArrays], bodies: Sequence[int], grid: Grid, backend: Backend, runs: int = 1
+    groups: Sequence[ParticleArrays], bodies: Sequence[int], grid: Grid, runs: int = 1
 ) -> "ParticleContact | None":
     """Return the contact of a scene with these numbers of bodies per group, or None without contact."""
-    if not groups[0].total or max(bodies) < 2:
-        return None
-    if not backend.on_cpu:
-        raise InputError(
-            f'solver.solids = "total" supports several bodies only on the CPU, not on {backend.arch}; use --arch cpu'
-        )
-    return ParticleContact(grid, groups[0], runs)
+    return ParticleContact(grid, groups[0], runs) if groups[0].total and max(bodies) > 1 else None
 
 
 def bins_along(cells: Sequence[int]) -> tuple[int, ...]:
@@ -170,7 +163,7 @@ def bins_along(cells: Sequence[int]) -> tuple[int, ...]:
 
 
 @ti.data_oriented
-class ParticleContact:
+class ParticleContact(Feature):
     """Bins of the particles of one law of each run, and the repulsion between their bodies.
 
     Attributes:
@@ -190,7 +183,7 @@ class ParticleContact:
         self.following = ti.field(int, shape=group.x.shape[0])
         self.meets = ti.field(int, shape=group.x.shape[0])
 
-    def fields(self) -> dict[str, ti.Field]:
+    def saved(self) -> dict[str, ti.Field]:
         return {"contact.first": self.first, "contact.following": self.following, "contact.meets": self.meets}
 
     @ti.func

@@ -15,9 +15,9 @@ from mpmcli.boundaries.rigid_bodies import RigidBodies
 from mpmcli.boundaries.rigid_contact import RigidContact
 from mpmcli.boundaries.walls import REACH as WALLS_REACH
 from mpmcli.boundaries.walls import MovingFaces, RoughFaces, Walls, faces_on_grid
-from mpmcli.errors import InputError, RunError
+from mpmcli.errors import RunError
 from mpmcli.quick_taichi import ti
-from mpmcli.solver.contact.body_contact import EXTREMES, BodyContact
+from mpmcli.solver.contact.body_contact import BodyContact
 from mpmcli.solver.contact.collider_points import ColliderPoints
 from mpmcli.solver.contact.total_solids import DRIFT, contact_between, slips_in
 from mpmcli.solver.drive.forces import DriveValues, Gravity, HostValues, RigidDrive, push_on
@@ -36,7 +36,6 @@ from mpmcli.solver.grid.sparse_grid import (
     BlockOrder,
     SparseGrid,
     most_blocks,
-    require_cpu_if_sparse,
     room_for_blocks,
     tiles_reached,
 )
@@ -85,11 +84,6 @@ class Batch:
         d = kind.dimension
         self.kind, self.runs, self.backend = kind, runs, backend
         on_cpu = backend.on_cpu
-        require_cpu_if_sparse(kind.settings, backend)
-        if (kind.colliders.moving or kind.colliders.free) and not backend.doubles:
-            raise InputError(
-                f"moving colliders need double precision, which --arch {backend.arch} lacks; use --arch cpu"
-            )
         # Many small runs on a GPU fit its cache; they are not sorted and use all nodes of their domains.
         sorts = on_cpu or runs == 1 or kind.inflow.any or kind.layers.separate
         scheme = scheme_of(kind.settings, keeps_flip_velocity=kind.keeps_motion)
@@ -135,7 +129,7 @@ class Batch:
             grid.fixed = FixedPoint(grid, groups, backend.arch)
         self.sort_buffers = SortBuffers(groups, runs) if sorts else None
         orders = self._make_orders(groups, grid) if sorts else []
-        contact = contact_between(groups, kind.bodies, grid, backend, runs)
+        contact = contact_between(groups, kind.bodies, grid, runs)
         colliders = motion = rigid = surfaces = points = None
         if kind.layers.separate:
             surfaces = BodyContact(groups, orders, grid, kind.layers, runs, backend.threads, on_cpu=on_cpu)
@@ -188,14 +182,8 @@ class Batch:
         self.profile: Counter | None = None
         self.frame_buffer = self._buffer = np.zeros((runs, 1), groups[0].real)
         if on_cpu:
-            noted = [
-                one.loads.capacity * one.loads.width for one in (colliders, self.device.contact) if one is not None
-            ]
-            noted += [len(EXTREMES)] * kind.layers.separate
-            noted += [rigid.count * (rigid.width + rigid.loads)] if rigid else []
-            self.frame_stats = np.zeros(
-                (runs, MOST_FRAMES, len(FRAME_NUMBERS) + len(groups) * sum_entries(d) + sum(noted))
-            )
+            noted = len(FRAME_NUMBERS) + len(groups) * sum_entries(d) + sum(one.noted for one in self.device.features)
+            self.frame_stats = np.zeros((runs, MOST_FRAMES, noted))
             self._build_cpu()
         else:
             self.gpu = GpuLaunch(self.device, self.layout, doubles=backend.doubles)

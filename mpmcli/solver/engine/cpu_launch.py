@@ -5,14 +5,13 @@ The results of a run are identical in every byte in any batch and on any number 
 
 import time
 from collections import Counter
+from itertools import accumulate
 
 import numpy as np
 
 from mpmcli.boundaries.doubles import as_double
-from mpmcli.boundaries.loads import Loads
-from mpmcli.boundaries.rigid_bodies import RigidBodies
+from mpmcli.boundaries.feature import Feature
 from mpmcli.quick_taichi import ti
-from mpmcli.solver.contact.body_contact import BodyContact
 from mpmcli.solver.engine.cpu_phases import CpuPhases, FrameBuffer, RunInts, RunReals
 from mpmcli.solver.engine.cpu_threads import LOOKS_IN_VAIN, CpuThreads
 from mpmcli.solver.engine.device import Device
@@ -256,15 +255,13 @@ class CpuLaunch:
 
     # Frames.
 
-    def takers(self) -> list[tuple[Loads | RigidBodies | BodyContact, int]]:
-        """Return the objects with loads in the statistics of a frame, and the first column of each."""
-        device, column = self.device, len(FRAME_NUMBERS) + len(self.members) * self.sum_count
-        found = []
-        if device.colliders is not None:
-            found.append((device.colliders.loads, column))
-            column += device.colliders.loads.capacity * device.colliders.loads.width
-        # A scene cannot have both separating bodies and freely moving colliders.
-        return found + [(each, column) for each in (device.rigid, device.contact) if each is not None]
+    def noting(self) -> list[tuple[Feature, int]]:
+        """Return the features with values in the statistics of a frame, and the first column of each."""
+        found = [one for one in self.device.features if one.noted]
+        columns = accumulate(
+            (one.noted for one in found), initial=len(FRAME_NUMBERS) + len(self.members) * self.sum_count
+        )
+        return list(zip(found, columns, strict=False))
 
     @ti.func
     def record(self, run: ti.template(), frame_stats: ti.template()):
@@ -279,8 +276,8 @@ class CpuLaunch:
                 frame_stats[run.w, frame, ti.static(len(FRAME_NUMBERS) + g * self.sum_count) + k] = sums[k]
             if sums[ti.static(SOUND)] == 0:
                 sound = False
-        for takers, column in ti.static(self.takers()):
-            takers.sum_up(run.w, frame, column, frame_stats)
+        for feature, column in ti.static(self.noting()):
+            feature.note(run.w, frame, column, frame_stats)
         for k, value in ti.static(enumerate(self.noted(run))):
             frame_stats[run.w, frame, k] = ti.cast(value, ti.f64)
         if sound:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mpmcli.boundaries.colliders import ColliderMotion, Colliders
+from mpmcli.boundaries.feature import Feature
 from mpmcli.boundaries.rigid_bodies import RigidBodies
 from mpmcli.boundaries.rigid_contact import RigidContact
 from mpmcli.boundaries.walls import MovingFaces, RoughFaces, Walls
@@ -81,6 +82,13 @@ class Device:
     def comes_and_goes(self) -> bool:
         """Whether particles enter or leave during a run."""
         return self.groups[0].comes_and_goes
+
+    @property
+    def features(self) -> tuple[Feature, ...]:
+        """The features of the scene, in the order in which they are written, and their values stored and named."""
+        walls, colliders = (self.friction, self.moving, self.grid.period), (self.colliders, self.motion)
+        bodies = self.rigid, self.rigid_contact, self.contact, self.points, self.particles.contact
+        return tuple(one for one in (*walls, *colliders, *bodies) if one is not None)
 
     @property
     def phases(self) -> tuple[Phase, ...]:

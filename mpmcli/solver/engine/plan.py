@@ -11,13 +11,12 @@ from mpmcli.materials.law import Law
 from mpmcli.plain_text import size_text
 from mpmcli.scene import Scene
 from mpmcli.scene.sampling import has_expressions
-from mpmcli.solver.contact.layers import Layers, require_contact_possible
 from mpmcli.solver.engine.batch import Batch
 from mpmcli.solver.engine.compiled_kind import CompiledKind
 from mpmcli.solver.engine.device import Device
+from mpmcli.solver.engine.refusals import require_possible
 from mpmcli.solver.frames.columns import FrameColumns
 from mpmcli.solver.grid.grid import Grid
-from mpmcli.solver.grid.sparse_grid import require_cpu_if_sparse
 from mpmcli.solver.machine.backend import LARGEST_INDEX, MEMORY_SHARE, Backend, free_memory
 from mpmcli.solver.machine.dry_run import DryField, fields_of
 
@@ -108,9 +107,7 @@ def make_plan(scene: Scene, backend: Backend) -> Plan:
     Raises:
         InputError: the scene combines what cannot be combined, or needs what the backend lacks.
     """
-    require_contact_possible(scene, backend)
-    _require_rigid_possible(scene)
-    require_cpu_if_sparse(scene.solver, backend)
+    require_possible(scene, backend)
     kind = CompiledKind.of(scene)
     with fields_of(backend.precision) as made:
         batch = Batch(kind.padded(), backend)
@@ -187,23 +184,6 @@ def _frame_columns(scene: Scene, members: Sequence[Law]) -> int:
     """Return how many numbers per particle a frame is built from."""
     internal = max(len(law.internal) for law in members)
     return FrameColumns(scene.dimension, internal, scene.output.fields, comes_and_goes=scene.comes_and_goes).count
-
-
-def _require_rigid_possible(scene: Scene) -> None:
-    """Raise an error for a scene that combines freely moving colliders with an unsupported feature.
-
-    Raises:
-        InputError: names the feature.
-    """
-    domain = scene.domain
-    reasons = {
-        "in a domain with periodic walls": any(domain.periodic),
-        "with moving walls": bool(domain.wall_velocity),
-        "with separating bodies": Layers.of(scene).separate,
-    }
-    for reason, applies in reasons.items():
-        if applies and any(collider.free for collider in scene.colliders):
-            raise InputError(f"colliders with a density are not available {reason}; omit their density.")
 
 
 def require_memory(plan: Plan) -> None:

@@ -8,17 +8,17 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from mpmcli.boundaries.rigid_motion import FAR
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.scene import BodyParticles, Scene, estimate_particles, sample_bodies
 from mpmcli.scene.colliders import Collider
-from mpmcli.solver.contact.layers import Layers, require_contact_possible
+from mpmcli.solver.contact.layers import Layers
 from mpmcli.solver.drive.expressions import RunValues
 from mpmcli.solver.drive.forces import Drives, ExternalForces
 from mpmcli.solver.engine.batch import Batch
 from mpmcli.solver.engine.compiled_kind import CompiledKind
 from mpmcli.solver.engine.emission import begin_emission
+from mpmcli.solver.engine.refusals import require_possible
 from mpmcli.solver.engine.run_group import RunGroup, groups_of, require_inside
 from mpmcli.solver.engine.run_state import (
     ATTEND,
@@ -133,10 +133,8 @@ class Run:
     def _write_scene(self) -> None:
         """Write the constants of a run: domain, walls, colliders, emitters and bounds on the step."""
         scene, device, state = self.scene, self.batch.device, self._state
-        walls, colliders = (device.friction, device.moving, device.grid.period), (device.colliders, device.motion)
-        for data in (*walls, *colliders, device.rigid, device.rigid_contact, device.contact, device.points):
-            if data is not None:
-                data.write(scene, self.slot)
+        for feature in device.features:
+            feature.write(scene, self.slot)
         h = scene.domain.spacing
         state.spacing, state.inverse_spacing = h, 1 / h
         state.gradient_scale = device.grid.scheme.spline.inverse_moment / h
@@ -353,19 +351,14 @@ class Run:
 
     def _read(self, arrays: FrameArrays) -> tuple[list[Sums], dict[str, np.ndarray]]:
         """Fill all rows of a frame; return the sums of each group and `Moment.loads`."""
-        loads, colliders = {}, self.batch.device.colliders
+        loads: dict[str, np.ndarray] = {}
         if self.backend.on_cpu:
             sums = self._recorder.read_now(arrays, self._launch_alone)
             sound = sums is not None
-            loads = {name: values[0] for name, values in self._recorder.loads(1).items()}
+            loads = self._recorder.loads(1)
         else:
-            if colliders is not None:
-                loads["collider"] = colliders.loads.read(self.slot, len(self.scene.colliders))
-            if (rigid := self.batch.device.rigid) is not None:
-                loads["rigid"], taken = rigid.read(self.slot)
-                loads["collider"][list(rigid.free)] += taken
-            if (contact := self.batch.device.contact) is not None:
-                loads |= contact.read(self.slot)
+            for feature in self.batch.device.features:
+                feature.name(feature.read(self.slot)[np.newaxis], self.slot, loads)
             gpu = self.batch.gpu
             gpu.begin_frame(self.batch.numbers, self.batch.counts)
             for g, group in enumerate(self.groups):
@@ -375,7 +368,7 @@ class Run:
             sound = (arrays["J"] > SMALLEST_J).all()
         if not sound:
             stop(self, self.last_step)
-        return sums, loads
+        return sums, {name: values[0] for name, values in loads.items()}
 
     # Start, and steps on request.
 
@@ -512,8 +505,9 @@ class Run:
             stop(self, self.last_step)
         self._measure_forces(self.last_step)
         if self._control.fresh:
-            rigid = self.batch.device.rigid
-            self._state.speed = max(self._control.speed, 0.0 if rigid is None else rigid.fastest(self.slot))
+            self._state.speed = max(
+                self._control.speed, *(one.fastest(self.slot) for one in self.batch.device.features)
+            )
 
     def _measure_forces(self, step: float) -> None:
         """Measure forces for the time until the next measurement, at most `state.longest` steps of `step`, s."""
@@ -579,11 +573,8 @@ class Run:
 
     def broken_body(self) -> Collider | None:
         """Return the first rigid body whose pose is not finite, or None."""
-        if (rigid := self.batch.device.rigid) is None:
-            return None
-        poses = rigid.pose.to_numpy()[self.slot * rigid.count :][: rigid.count]
-        broken = np.flatnonzero(~(np.abs(poses) < FAR).all(axis=1))
-        return self.scene.colliders[rigid.free[broken[0]]] if len(broken) else None
+        found = [k for one in self.batch.device.features if (k := one.broken(self.slot)) is not None]
+        return self.scene.colliders[found[0]] if found else None
 
     def lost(self) -> list[int | None]:
         """Return the solver index of a lost particle of each group, or None for a group without one."""
@@ -669,6 +660,6 @@ def build_run(
     Raises:
         InputError: a particle is outside the domain, or the backend cannot compute the scene.
     """
-    require_contact_possible(scene, backend)
+    require_possible(scene, backend)
     particles = particles or sample_bodies(scene)
     return Run(Batch(CompiledKind.of(scene, particles).padded(), backend), 0, scene, particles, force=force)

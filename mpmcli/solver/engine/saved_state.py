@@ -109,20 +109,9 @@ def _fields(batch: Batch) -> dict[str, ti.Field]:
             found |= {f"{group.law.name}.tile_start": order.start for group, order in pairs}
     for group in device.groups:
         found |= {f"{group.law.name}.{name}": field for name, field in group.fields().items()}
-    if device.colliders is not None:
-        found["colliders.taken"] = device.colliders.loads.taken
-    if device.motion is not None:
-        found["colliders.pose"] = device.motion.pose
-    if device.contact is not None:
-        found |= {"layers.low": device.contact.surfaces.low, "layers.high": device.contact.surfaces.high}
-        found |= {"contact.taken": device.contact.loads.taken, "contact.extremes": device.contact.extremes}
-    if device.rigid is not None:
-        found |= {
-            f"rigid.{name}": getattr(device.rigid, name)
-            for name in ("pose", "mobility", "ways", "weight", "momentum", "booked", "support")
-        }
-        found |= {f"rigid.{name}": getattr(device.rigid_contact, name) for name in ("other", "impulse")}
-    return found | ({} if device.particles.contact is None else device.particles.contact.fields())
+    for feature in device.features:
+        found |= feature.saved()
+    return found
 
 
 def _blocks(batch: Batch) -> dict[str, np.ndarray]:

@@ -7,7 +7,6 @@ import numpy as np
 
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
-from mpmcli.solver.contact.body_contact import EXTREMES, WORK
 from mpmcli.solver.engine.batch import Batch
 from mpmcli.solver.engine.run_state import FRAME_NUMBERS, LIMITS, MOST_FRAMES, RunState
 from mpmcli.solver.frames.builder import NO_STEPS, FrameBuilder, Moment, StepsTaken, Sums
@@ -91,21 +90,13 @@ class FrameRecorder:
 
     def loads(self, count: int) -> dict[str, np.ndarray]:
         """Return the loads up to the first `count` frames of the last launch, (count, ...), see `Moment.loads`."""
-        device, kind = self._batch.device, self._batch.kind
-        first, found = len(FRAME_NUMBERS) + len(kind.members) * sum_entries(kind.dimension), {}
+        kind, found = self._batch.kind, {}
+        first = len(FRAME_NUMBERS) + len(kind.members) * sum_entries(kind.dimension)
         rest = self._batch.frame_stats[self._slot, :count, first:].copy()
-        for name, takers in (("collider", device.colliders), ("contact", device.contact)):
-            if takers is not None:
-                size = takers.loads.capacity * takers.loads.width
-                number = kind.layers.pairs if name == "contact" else takers.count_of(self._slot)
-                own, rest = np.split(rest, [size], axis=1)
-                found[name] = own.reshape(count, -1, takers.loads.width)[:, :number]
-                if name == "contact":
-                    found[WORK] = own.reshape(count, -1, takers.loads.width)[:, number, 0]
-        if device.rigid is not None:
-            size = device.rigid.width + device.rigid.loads
-            found["rigid"] = rest[:, : device.rigid.count * size].reshape(count, -1, size)
-        return found if device.contact is None else found | dict(zip(EXTREMES, rest.T, strict=True))
+        for feature in self._batch.device.features:
+            own, rest = np.split(rest, [feature.noted], axis=1)
+            feature.name(own, self._slot, found)
+        return found
 
     def _sums(self, count: int) -> tuple[list[Sums], bool]:
         """Return the sums of each group at the first `count` frames of the last launch, and whether all were sound."""

@@ -10,6 +10,7 @@ from copy import copy
 
 import numpy as np
 
+from mpmcli.boundaries.feature import Feature
 from mpmcli.boundaries.rows import Rows
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
@@ -33,7 +34,7 @@ def opaque_signed(x: float):
 
 
 @ti.data_oriented
-class Period:
+class Period(Feature):
     """The periodic axes of all runs, and the extent of the domain of each run.
 
     Attributes:

@@ -13,14 +13,12 @@ import numpy as np
 import psutil
 
 from mpmcli.boundaries.walls import REACH
-from mpmcli.errors import InputError
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
 from mpmcli.scene.sampling import estimate_body
-from mpmcli.scene.schema import SolverSettings
 from mpmcli.scene.sheets import sheets_of
 from mpmcli.solver.grid.grid import Grid, LinearNodes, drift_allowed
-from mpmcli.solver.machine.backend import LARGEST_INDEX, MEMORY_SHARE, Backend
+from mpmcli.solver.machine.backend import LARGEST_INDEX, MEMORY_SHARE
 from mpmcli.solver.particles.sort import ACTIVE, SPAN, TileOrder
 from mpmcli.solver.transfer.splines import PAD, SPLINES
 
@@ -506,8 +504,3 @@ def filled_cells(scene: Scene) -> float:
     """Return the number of cells filled by all material of a scene at rest."""
     bodies = sum(estimate_body(body, scene.domain.spacing) / body.particles_per_cell for body in scene.bodies)
     return bodies + sum(sheets_of(emitter, scene).particles / emitter.particles_per_cell for emitter in scene.emitters)
-
-
-def require_cpu_if_sparse(settings: SolverSettings, backend: Backend) -> None:
-    if settings.grid == "sparse" and not backend.on_cpu:
-        raise InputError('solver.grid = "sparse" is available only on the CPU; use "auto" or "dense", or --arch cpu.')
