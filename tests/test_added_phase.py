@@ -1,37 +1,63 @@
-"""A phase that is added to the step, as docs/architecture.md says: one function of a node, on every device and grid."""
+"""A feature that is added to the solver, as docs/architecture.md says: one file, and a line in a list of features."""
 
 from collections.abc import Callable
+from itertools import pairwise
 
 import numpy as np
 import pytest
+from added_feature import Drag
 from scenes import block
 from solver_state import scene_of
+from taichi.lang import kernel_impl
 
-from mpmcli.quick_taichi import ti
-from mpmcli.solver.engine import device, kernel_store
-from mpmcli.solver.engine.run import build_run
-from mpmcli.solver.engine.step import Phase, step_phases
+from mpmcli.scene import Scene
+from mpmcli.solver.engine import batch, kernel_store
+from mpmcli.solver.engine.batch import Batch
+from mpmcli.solver.engine.compiled_kind import CompiledKind
+from mpmcli.solver.engine.plan import make_plan
+from mpmcli.solver.engine.run import Run, build_run, frames_of_all
+from mpmcli.solver.features import Features
 
-RATE, STEP, COUNT = 2.0, 1e-3, 100
+RATE, STEP, COUNT, STARTS = 20.0, 1e-3, 100, ([-1.0, 0.5], [1.0, 0.0])
 JELLY = {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 1e4, "poissons_ratio": 0.3}
 
 
-@ti.func
-def drag(at: ti.template(), node: ti.template(), kick: float):
-    """Slow a node: v <- v / (1 + c dt)."""
-    index = at.grid.linear_index(node)
-    for a in ti.static(range(at.grid.dimension)):
-        at.grid.nodes[index][a] = at.grid.nodes[index][a] / (1.0 + RATE * kick)
+class WithDrag(Features):
+    """The features with the line that adds a drag; None stands for a kind of scenes without one."""
+
+    has = True
+
+    def __init__(self, kind: CompiledKind, backend: object, runs: int, *given: object) -> None:
+        super().__init__(kind, backend, runs, *given)
+        self.drag = Drag(runs) if self.has else None
 
 
-def with_drag(*given: object, **flags: object) -> tuple[Phase, ...]:
-    """Return the phases of a step, drag behind the update of nodes."""
-    phases = step_phases(*given, **flags)
-    at = 1 + next(k for k, phase in enumerate(phases) if phase.name == "update")
-    return (*phases[:at], Phase("drag", "nodes", body=drag), *phases[at:])
+@pytest.fixture(autouse=True)
+def added(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(batch, "Features", WithDrag)
+    monkeypatch.setenv(kernel_store.SWITCH, "off")
 
 
-@pytest.mark.parametrize(
+def flying(rate: float = RATE, *, precision: str = "f64", frames: int = 1, **more: dict) -> Scene:
+    """Return two bodies that fly apart."""
+    places = ("left", [0.3, 0.4], [0.5, 0.6]), ("right", [0.8, 0.4], [1.0, 0.6])
+    return scene_of(
+        title=f"drag {rate}",
+        domain={"size": [1.4, 1.0], "spacing": 0.05, "gravity": [0.0, 0.0]},
+        time={"end": 0.1, "frames": frames, "step": STEP},
+        bodies=[block(name, JELLY, *box) | {"velocity": v} for (name, *box), v in zip(places, STARTS, strict=True)],
+        solver={"precision": precision} | more.get("solver", {}),
+        **{name: table for name, table in more.items() if name != "solver"},
+    )
+
+
+def left(rate: float) -> float:
+    """Return the share of the velocity after COUNT steps: of each 1 / (1 + c s kick), the first kick half a step."""
+    kicks = np.array([STEP / 2] + [STEP] * (COUNT - 1))
+    return float(np.prod(1 / (1 + rate * np.cumsum(kicks) * kicks)))
+
+
+ARCHES = pytest.mark.parametrize(
     ("arch", "threads", "more"),
     [
         ("cpu", 1, {}),
@@ -42,28 +68,60 @@ def with_drag(*given: object, **flags: object) -> tuple[Phase, ...]:
     ],
     ids=["one thread", "three threads", "sparse", "layers", "gpu"],
 )
-def test_a_drag_on_nodes_slows_all_that_flies(
-    backend_of: Callable, monkeypatch: pytest.MonkeyPatch, arch: str, threads: int, more: dict
+
+
+@ARCHES
+def test_a_drag_slows_all_that_flies_and_goes_on_after_a_pause(
+    backend_of: Callable, arch: str, threads: int, more: dict
 ) -> None:
-    """Two bodies that fly apart: each step divides v by 1 + c kick, the first kick being half a step."""
-    monkeypatch.setattr(device, "step_phases", with_drag)
-    monkeypatch.setenv(kernel_store.SWITCH, "off")
-    bodies = [
-        block("left", JELLY, [0.3, 0.4], [0.5, 0.6]) | {"velocity": [-1.0, 0.5]},
-        block("right", JELLY, [0.8, 0.4], [1.0, 0.6]) | {"velocity": [1.0, 0.0]},
-    ]
+    """By the formula; the ledger has the time that it has lasted; a run that was saved in between goes on alike."""
     precision = "f64" if arch == "cpu" else "f32"
-    asked = scene_of(
-        domain={"size": [1.4, 1.0], "spacing": 0.05, "gravity": [0.0, 0.0]},
-        time={"end": 1.0, "frames": 1},
-        bodies=bodies,
-        solver={"precision": precision} | more.get("solver", {}),
-        **{name: table for name, table in more.items() if name != "solver"},
-    )
-    run = build_run(asked, backend_of(precision, threads, arch))
-    for _ in range(COUNT):
+    asked, backend = flying(precision=precision, **more), backend_of(precision, threads, arch)
+    run = build_run(asked, backend)
+    for k in range(COUNT):
+        if k == COUNT // 2:
+            saved = run.save().copied()
         run.step(STEP)
-    velocity, body = run.frame()[0].velocity, run.frame()[0].body
-    left = 1 / ((1 + RATE * STEP / 2) * (1 + RATE * STEP) ** (COUNT - 1))
-    for k, start in enumerate(([-1.0, 0.5], [1.0, 0.0])):
-        np.testing.assert_allclose(velocity[body == k].mean(axis=0), np.multiply(left, start), rtol=1e-5, atol=1e-6)
+    frame, row = run.frame()
+    for k, start in enumerate(STARTS):
+        own = frame.velocity[frame.body == k].mean(axis=0)
+        np.testing.assert_allclose(own, np.multiply(left(RATE), start), rtol=1e-5, atol=1e-6)
+    assert row.contact_gap == pytest.approx((COUNT - 0.5) * STEP, rel=1e-5)
+    again = build_run(asked, backend)
+    again.load(saved)
+    for _ in range(COUNT // 2, COUNT):
+        again.step(STEP)
+    close = {} if arch == "cpu" else {"rtol": 1e-5, "atol": 1e-6}
+    np.testing.assert_allclose(again.frame()[0].velocity, frame.velocity, **close or {"rtol": 0, "atol": 0})
+
+
+def test_runs_of_a_batch_have_drags_of_their_own(backend_of: Callable) -> None:
+    scenes = [flying(rate, frames=2) for rate in (RATE, 3 * RATE)]
+    together = Batch(CompiledKind.of(scenes[0]), backend_of("f64", 1), len(scenes))
+    ends = {}
+    for slot, event in frames_of_all({slot: Run(together, slot, scene) for slot, scene in enumerate(scenes)}):
+        if event is not None:
+            ends[slot] = event[0]
+    for slot, rate in enumerate((RATE, 3 * RATE)):
+        own = ends[slot].velocity[ends[slot].body == 1].mean(axis=0)
+        np.testing.assert_allclose(own, np.multiply(left(rate), STARTS[1]), rtol=1e-5, atol=1e-6)
+
+
+def test_it_is_planned_to_the_byte_and_absent_elsewhere(backend_of: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two numbers of a run and a pass of its step; without a drag nothing calls its function."""
+    asked, backend, called, call = flying(), backend_of("f64", 1), set(), kernel_impl.Func.__call__
+
+    def noted(self: kernel_impl.Func, *given: object, **named: object) -> object:
+        called.add(self.func.__name__)
+        return call(self, *given, **named)
+
+    monkeypatch.setattr(kernel_impl.Func, "__call__", noted)
+    plans = []
+    for has in (False, True):
+        monkeypatch.setattr(WithDrag, "has", has)
+        plans.append(make_plan(asked, backend))
+        build_run(asked, backend).step(STEP)
+        assert ("update_massive" in called, "slow" in called) == (True, has)
+    assert plans[1].device_bytes - plans[0].device_bytes == 2 * 8
+    assert [b for a, b in pairwise(plans[1].passes) if a == "update grid"] == ["slow nodes"]
+    assert tuple(name for name in plans[1].passes if name != "slow nodes") == plans[0].passes

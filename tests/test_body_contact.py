@@ -260,7 +260,7 @@ def test_a_step_is_that_of_plain_numpy(backend_of: Callable, dimension: int) -> 
         state = found[both.bodies[k].name]
         assert np.abs(state.v - after.v).max() < 1e-12 * np.abs(after.v).max()
         assert np.abs(state.C - after.C).max() < 1e-11 * np.abs(after.C).max()
-    booked = run.batch.device.colliders.loads.taken.to_numpy().sum(0)
+    booked = run.batch.device.features.colliders.loads.taken.to_numpy().sum(0)
     assert booked[:d] == pytest.approx(taken, rel=1e-12)
 
 

@@ -525,7 +525,7 @@ def test_a_pose_that_is_not_finite_stops_the_run(backend_of: Callable) -> None:
     run = build_run(asked, backend_of("f64", 1))
     frames = run.frames()
     next(frames)
-    pose = run.batch.device.rigid.pose
+    pose = run.batch.device.features.rigid.pose
     values = pose.to_numpy()
     values[0, 1] = math.nan
     pose.from_numpy(values)

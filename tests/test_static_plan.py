@@ -113,10 +113,10 @@ def test_a_plain_scene_has_nothing_of_features(backend_of: Callable, given: Coun
     kernels = {module: count for (what, module), count in given.items() if what == "kernel" and "." in module}
     kernels.pop("taichi._kernels", None)
     assert kernels == {"solver.engine.cpu_launch": 1, "solver.particles.arrays": 1, "boundaries.rows": 1}
-    kind, device = run.batch.kind, run.batch.device
+    kind, features = run.batch.kind, run.batch.device.features
     assert (kind.rough, kind.moving, kind.colliders.count, kind.inflow.any) == ((), (), 0, False)
-    assert (device.colliders, device.motion, run.batch.pushes) == (None, None, [None])
-    assert (device.friction.faces, device.moving.faces, device.emission) == ((), (), None)
+    assert (features.colliders, features.motion, run.batch.pushes) == (None, None, [None])
+    assert (features.friction.faces, features.moving.faces, features.emission) == ((), (), None)
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ import numpy as np
 
 from mpmcli.boundaries.distances import DISTANCES, BoxDistance, GridDistance, samples_of
 from mpmcli.boundaries.doubles import double_field
-from mpmcli.boundaries.feature import Feature
+from mpmcli.boundaries.feature import Feature, Phase, changed
 from mpmcli.boundaries.loads import Loads
 from mpmcli.boundaries.rows import Rows
 from mpmcli.quick_taichi import ti
@@ -230,6 +230,13 @@ class Colliders(Feature):
     def saved(self) -> dict[str, ti.Field]:
         return {"colliders.taken": self.loads.taken}
 
+    def phases(self, **_how: bool) -> tuple[Phase, ...]:
+        # Sums in fixed point leave the loads to a phase of their own.
+        return (Phase("add_loads", "loads", "loads", words="add up loads"),) if self.deterministic else ()
+
+    def viewed(self, view: object) -> "Colliders":
+        return changed(self, run=view.w, spacing=view.grid.spacing)
+
     @property
     def noted(self) -> int:
         return self.capacity * self.loads.width
@@ -241,7 +248,7 @@ class Colliders(Feature):
     def read(self, run: int) -> np.ndarray:
         return self.loads.read(run).ravel()
 
-    def name(self, values: np.ndarray, run: int, found: MutableMapping[str, np.ndarray]) -> None:
+    def tell(self, values: np.ndarray, run: int, found: MutableMapping[str, np.ndarray]) -> None:
         found["collider"] = values.reshape(len(values), self.capacity, -1)[:, : self._counts[run]]
 
     @ti.kernel
@@ -472,6 +479,8 @@ class ColliderMotion(Feature):
         rates: means in the step of the velocity, m/s, and the spin, rad/s. The host sets constant rates.
     """
 
+    begins = True
+
     def __init__(self, colliders: Colliders, runs: int) -> None:
         d = colliders.dimension
         self.colliders, self.dimension, self.moving = colliders, d, colliders.kind.moving
@@ -494,6 +503,11 @@ class ColliderMotion(Feature):
 
     def saved(self) -> dict[str, ti.Field]:
         return {"colliders.pose": self.pose}
+
+    @ti.func
+    def begin_step(self, phases: ti.template(), run: ti.template(), _step: ti.template()):
+        phases.device.values.set_motions(run.w, self, run.time, run.time + run.dt)
+        self.advance(run.w, run.dt)
 
     @ti.func
     def advance(self, run: int, dt: ti.f64):

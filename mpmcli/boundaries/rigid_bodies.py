@@ -12,6 +12,7 @@ import numpy as np
 
 from mpmcli.boundaries.colliders import Colliders
 from mpmcli.boundaries.doubles import double_field
+from mpmcli.boundaries.feature import changed
 from mpmcli.boundaries.rigid_motion import RigidMotion
 from mpmcli.quick_taichi import ti
 
@@ -31,12 +32,21 @@ class RigidBodies(RigidMotion):
         entries: number of entries of each sum.
     """
 
+    begins = True
+
     def __init__(self, colliders: Colliders, pushes: object, runs: int) -> None:
         super().__init__(colliders, pushes, runs)
         n = runs * self.count
         self.entries = self.loads + self.loads * (self.loads + 1) // 2
         self.sums = double_field(n * colliders.loads.rows, self.entries)
         self.total = double_field(n, self.entries)
+
+    def viewed(self, view: object) -> "RigidBodies":
+        return changed(self, run=view.w, colliders=view.features.colliders)
+
+    @ti.func
+    def begin_step(self, phases: ti.template(), run: ti.template(), step: ti.template()):
+        self.begin(run.w, run.dt, step.kick, phases.gravity_of(step))
 
     @property
     def noted(self) -> int:
@@ -66,7 +76,7 @@ class RigidBodies(RigidMotion):
         self.booked.from_numpy(booked)
         return np.hstack([self.pose.to_numpy()[own], rates, taken]).ravel()
 
-    def name(self, values: np.ndarray, _run: int, found: MutableMapping[str, np.ndarray]) -> None:
+    def tell(self, values: np.ndarray, _run: int, found: MutableMapping[str, np.ndarray]) -> None:
         own = values.reshape(len(values), self.count, -1)
         found["rigid"] = own[..., : -self.loads]
         found["collider"][:, list(self.free)] += own[..., -self.loads :]

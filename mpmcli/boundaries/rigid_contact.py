@@ -10,7 +10,7 @@ import numpy as np
 
 from mpmcli.boundaries.colliders import HOLD, STICK, contact_points
 from mpmcli.boundaries.doubles import double_field
-from mpmcli.boundaries.feature import Feature
+from mpmcli.boundaries.feature import Feature, Phase
 from mpmcli.boundaries.rigid_bodies import RigidBodies
 from mpmcli.boundaries.rows import Rows
 from mpmcli.quick_taichi import ti
@@ -29,6 +29,38 @@ STUCK = 1e3
 WALL, NOTHING = -1, -2
 # Rebound of a point that may pass a surface in this step and separates from it in the next.
 LATER = -1.0
+# Turns of the phase that moves bodies: they take the momentum from nodes, their contact is resolved, and they move.
+MOVES = 3
+
+
+@ti.func
+def move_part(phases: ti.template(), at: ti.template()):
+    """Carry out a turn on the CPU, in one thread of a run."""
+    if at.region == 0 and at.part == 0:
+        for turn in ti.static(range(MOVES)):
+            if at.turn == turn:
+                move_bodies(phases, at, turn)
+
+
+@ti.func
+def move_item(phases: ti.template(), at: ti.template()):
+    """Carry out a turn on a GPU."""
+    move_bodies(phases, at, at.turn)
+
+
+@ti.func
+def move_bodies(phases: ti.template(), at: ti.template(), turn: ti.template()):
+    """Transfer momentum from nodes to rigid bodies (turn 0), resolve their contact (1), or move them (2)."""
+    (rigid,) = ti.static((at.features.rigid,))
+    if ti.static(turn == 0):
+        rigid.take(at.w, at.run.dt)
+    if ti.static(turn == 1):
+        phases.device.features.rigid_contact.resolve(at.w, at.run.dt, at.particles.extent, at.features.colliders)
+    if ti.static(turn == 2):
+        fastest, finite = rigid.move(at.w, at.run.dt)
+        ti.atomic_max(at.step.speed_squared, fastest)
+        if not finite:
+            at.step.broken = 1.0
 
 
 @ti.data_oriented
@@ -83,6 +115,10 @@ class RigidContact(Feature):
 
     def saved(self) -> dict[str, ti.Field]:
         return {"rigid.other": self.other, "rigid.impulse": self.impulse}
+
+    def phases(self, **_how: bool) -> tuple[Phase, ...]:
+        how = {"turns": MOVES, "part": move_part, "item": move_item}
+        return (Phase("move_bodies", "runs", "move", **how, words="move rigid bodies"),)
 
     @ti.func
     def resolve(self, run: int, dt: ti.f64, extent: ti.template(), colliders: ti.template()):

@@ -8,7 +8,7 @@ import math
 from collections.abc import Sequence
 from copy import copy
 
-from mpmcli.boundaries.feature import Feature
+from mpmcli.boundaries.feature import Feature, changed
 from mpmcli.boundaries.rows import Rows
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
@@ -54,6 +54,9 @@ class MovingFaces(Feature):
             found = scene.domain.wall_velocities
             self._rows.write(run * len(self.faces), [found[axis][side] for axis, side in self.faces])
 
+    def viewed(self, view: object) -> "MovingFaces":
+        return changed(self, first=view.w * len(self.faces))
+
     @ti.func
     def of(self, face: ti.template()):
         """Return the velocity of a face by its index in `faces`."""
@@ -91,6 +94,9 @@ class RoughFaces(Feature):
         if self.faces:
             found = scene.domain.frictions
             self._rows.write(run * len(self.faces), [found[axis][side] for axis, side in self.faces])
+
+    def viewed(self, view: object) -> "RoughFaces":
+        return changed(self, first=view.w * len(self.faces))
 
     @ti.func
     def of(self, face: ti.template()):

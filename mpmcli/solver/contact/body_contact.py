@@ -14,7 +14,7 @@ from collections.abc import MutableMapping, Sequence
 import numpy as np
 
 from mpmcli.boundaries.colliders import DEEP
-from mpmcli.boundaries.feature import Feature
+from mpmcli.boundaries.feature import Feature, Phase
 from mpmcli.boundaries.loads import Loads
 from mpmcli.boundaries.rows import Rows
 from mpmcli.materials.elementary import exp, log
@@ -22,6 +22,7 @@ from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
 from mpmcli.scene.sampling import lattice_spacing
 from mpmcli.solver.contact.collider_points import EMPTY, FREE, FULL, LEAST, smooth
+from mpmcli.solver.contact.contact_phases import contact_phases, obstacles_of
 from mpmcli.solver.contact.layers import Layers
 from mpmcli.solver.contact.surfaces import FAR, REACH, BodySurfaces, place_of
 from mpmcli.solver.grid.grid import Grid
@@ -94,6 +95,8 @@ class BodyContact(Feature):
             node moves the point; vectors and normals of the second body have the opposite sign.
     """
 
+    begins = True
+
     def __init__(
         self,
         groups: Sequence[ParticleArrays],
@@ -136,6 +139,17 @@ class BodyContact(Feature):
                 bands[layer] = distance
         self._rows.write(run * self.layers, np.hstack([rows, layers.frictions(scene)]), bands)
 
+    def phases(self, *, serial: bool) -> tuple[Phase, ...]:
+        return contact_phases(self.surfaces.groups, serial=serial)
+
+    @ti.func
+    def begin_step(self, phases: ti.template(), run: ti.template(), _step: ti.template()):
+        """Find where bodies may be in contact in a step, with the current positions of colliders."""
+        drift = ti.cast(ti.ceil(run.drift), int)
+        (view,) = ti.static(phases.see(run))
+        (obstacles,) = ti.static((obstacles_of(view),))
+        self.surfaces.find_box(phases.device.grid, obstacles, run.w, drift, view.particles.last)
+
     def saved(self) -> dict[str, ti.Field]:
         own = {"contact.taken": self.loads.taken, "contact.extremes": self.extremes}
         return {"layers.low": self.surfaces.low, "layers.high": self.surfaces.high} | own
@@ -151,7 +165,7 @@ class BodyContact(Feature):
         self.extremes.from_numpy(extremes)
         return found
 
-    def name(self, values: np.ndarray, _run: int, found: MutableMapping[str, np.ndarray]) -> None:
+    def tell(self, values: np.ndarray, _run: int, found: MutableMapping[str, np.ndarray]) -> None:
         loads, extremes = np.split(values, [-len(EXTREMES)], axis=1)
         loads = loads.reshape(len(values), -1, self.loads.width)
         found |= {"contact": loads[:, :-1], WORK: loads[:, -1, 0], **dict(zip(EXTREMES, extremes.T, strict=True))}

@@ -11,10 +11,10 @@ points are found. A step calls, with a barrier after each: `find`, `spread_out`,
 """
 
 import math
-from copy import copy
 
 from mpmcli.boundaries.colliders import HELD, HOLD, LOOSE, PRESSED, SEPARATE, STICK, Colliders
-from mpmcli.boundaries.feature import Feature
+from mpmcli.boundaries.feature import Feature, Phase, changed
+from mpmcli.boundaries.rigid_bodies import ROUNDS
 from mpmcli.materials.law import StateBound
 from mpmcli.materials.registry import laws
 from mpmcli.quick_taichi import ti
@@ -69,6 +69,8 @@ class ColliderPoints(Feature):
         part: share of the point that belongs to the domain: a half on a wall.
         gain: impulse per velocity, kg.
         lift: velocity at which material moves out of the collider, m/s.
+        couples: whether rigid bodies are met.
+        fills: whether the inside of colliders counts as filled, because some volumes relax.
         given: velocity of the material times `share`, then the impulse per weight on the material, N s.
     """
 
@@ -89,6 +91,7 @@ class ColliderPoints(Feature):
         self.rows = math.prod(colliders.shape[:-1])
         self.busy, self.marked = ti.field(int, shape=runs * self.rows), ti.field(int, shape=runs * self.rows)
         self.spline = QuadraticSpline()
+        self.couples = self.fills = False
 
     @staticmethod
     def room(nodes: int, dimension: int) -> int:
@@ -98,14 +101,35 @@ class ColliderPoints(Feature):
     def on(self, nodes: int) -> "ColliderPoints":
         """Return points for a grid with another number of nodes, and the same numbers of runs."""
         result = ColliderPoints(self.colliders, nodes, self.layers, self.density.shape[0])
-        result.density, result.rate = self.density, self.rate
+        result.density, result.rate, result.couples, result.fills = self.density, self.rate, self.couples, self.fills
         return result
 
-    def seen_from(self, run: object, colliders: Colliders) -> "ColliderPoints":
-        """Return the view of a run, given its number, a variable of a kernel, and its colliders."""
-        result = copy(self)
-        result.run, result.colliders = run, colliders
-        return result
+    def viewed(self, view: object) -> "ColliderPoints":
+        return changed(self, run=view.w, colliders=view.features.colliders)
+
+    def phases(self, **_how: bool) -> tuple[Phase, ...]:
+        fills = [Phase("fill_solids", "nodes", "scatter", body=fill_solids, wanted=near_row)]
+        found = [
+            *fills * self.fills,
+            Phase("find_points", "nodes", "points", body=find_points, wanted=new_row, words="find points of colliders"),
+            Phase("spread_points", "nodes", "points", body=spread_points, wanted=marked_row),
+            Phase(
+                "weigh_points",
+                "nodes",
+                "points",
+                body=weigh_points,
+                wanted=busy_row,
+                words="find impulses of colliders",
+            ),
+        ]
+        if self.couples:
+            how = {"turns": 2, "rounds": ROUNDS, "part": meet_part, "item": meet_item, "words": "meet rigid bodies"}
+            found += [
+                Phase("meet", "rows", "points", body=meet_points, wanted=busy_row, **how),
+                Phase("settle_points", "nodes", "points", body=settle_points, wanted=busy_row),
+            ]
+        push = Phase("push_points", "nodes", "points", body=push_points, wanted=last_row, words="let colliders push")
+        return (*found, push)
 
     def write(self, scene: Scene, run: int = 0) -> None:
         """Set the mass of a full node of a run, and the rate."""
@@ -407,7 +431,7 @@ class ColliderPoints(Feature):
                     p = self.next[p] - 1
 
     @ti.func
-    def weigh(self, grid: ti.template(), walls: ti.template(), node: ti.template(), meets: ti.template()):
+    def weigh(self, grid: ti.template(), walls: ti.template(), node: ti.template()):
         """Find the gain of the points of a node, and their impulses, unless rigid bodies have yet to be met."""
         d = ti.static(self.dimension)
         p = self.head[self.place(grid.linear_index(node))] - 1
@@ -425,7 +449,7 @@ class ColliderPoints(Feature):
             self.gain[p] = self.gain[p] / resistance if resistance > 0.0 else 0.0
             for a in ti.static(range(d)):
                 self.given[p][a] = seen[a]
-            if ti.static(not meets):
+            if ti.static(not self.couples):
                 self.settle_point(node, p)
             p = self.next[p] - 1
 
@@ -580,47 +604,65 @@ class ColliderPoints(Feature):
 def fill_solids(at: ti.template(), node: ti.template(), _kick: float):
     """Count colliders as filled, in steps that relax volumes."""
     if at.nodes.colliders.own == 0 and at.step.relaxed > 0.0:
-        at.points.fill(at.grid, at.nodes.images.walls, node)
+        at.features.points.fill(at.grid, at.nodes.images.walls, node)
 
 
 @ti.func
 def find_points(at: ti.template(), node: ti.template(), _kick: float):
     """Find the points of a node."""
     if at.nodes.colliders.own == 0:
-        at.points.find(at.grid, at.nodes.images.walls, at.particles.extent, node)
+        at.features.points.find(at.grid, at.nodes.images.walls, at.particles.extent, node)
 
 
 @ti.func
 def spread_points(at: ti.template(), node: ti.template(), _kick: float):
     """Sum the weights of points at a node."""
     if at.nodes.colliders.own == 0:
-        at.points.spread_out(at.grid, at.nodes.images.walls, node)
+        at.features.points.spread_out(at.grid, at.nodes.images.walls, node)
 
 
 @ti.func
 def weigh_points(at: ti.template(), node: ti.template(), _kick: float):
     """Find the gains of the points of a node, and without rigid bodies their impulses."""
     if at.nodes.colliders.own == 0:
-        at.points.weigh(at.grid, at.nodes.images.walls, node, at.nodes.couples)
+        at.features.points.weigh(at.grid, at.nodes.images.walls, node)
 
 
 @ti.func
 def meet_points(at: ti.template(), node: ti.template(), _kick: float):
     """Add the impulses of the points of a node to the sums of rigid bodies."""
-    at.points.meet(at.grid, node, at.nodes.rigid)
+    at.features.points.meet(at.grid, node, at.features.rigid)
+
+
+@ti.func
+def meet_part(phases: ti.template(), at: ti.template()):
+    """Find the velocities of rigid bodies: sum the impulses of points in even turns, and solve in odd turns."""
+    if at.turn % 2 == 0:
+        phases.each_node(at)
+    elif at.region == 0 and at.part == 0:
+        at.features.rigid.solve(at.w, at.run.dt)
+
+
+@ti.func
+def meet_item(phases: ti.template(), at: ti.template()):
+    """The same for a row of nodes, or a run, on a GPU."""
+    if ti.static(at.turn % 2 == 0):
+        phases.each_row(at)
+    elif at.q == 0:
+        at.features.rigid.solve(at.w, at.run.dt)
 
 
 @ti.func
 def settle_points(at: ti.template(), node: ti.template(), _kick: float):
     """Find the impulses of the points of a node after rigid bodies have been met."""
-    at.points.settle(at.grid, node)
+    at.features.points.settle(at.grid, node)
 
 
 @ti.func
 def push_points(at: ti.template(), node: ti.template(), _kick: float):
     """Give the impulses of points to a node."""
     if at.nodes.colliders.own == 0:
-        squared = at.points.push(at.grid, at.nodes.images.walls, node)
+        squared = at.features.points.push(at.grid, at.nodes.images.walls, node)
         if ti.static(at.atomic):
             at.peaks.include(at.w, 0, squared)
         elif squared > at.step.speed_squared:
@@ -633,32 +675,32 @@ def push_points(at: ti.template(), node: ti.template(), _kick: float):
 @ti.func
 def near_row(at: ti.template(), node: ti.template()):
     """Return whether the row may be near a collider."""
-    return at.points.near_row(node)
+    return at.features.points.near_row(node)
 
 
 @ti.func
 def new_row(at: ti.template(), node: ti.template()):
     """Return whether the row may be near a collider; no point of it is found yet."""
-    at.points.busy[at.points.row_of(node)] = 0
-    return at.points.near_row(node)
+    at.features.points.busy[at.features.points.row_of(node)] = 0
+    return at.features.points.near_row(node)
 
 
 @ti.func
 def busy_row(at: ti.template(), node: ti.template()):
     """Return whether the row has points."""
-    return at.points.busy[at.points.row_of(node)] == 1
+    return at.features.points.busy[at.features.points.row_of(node)] == 1
 
 
 @ti.func
 def marked_row(at: ti.template(), node: ti.template()):
     """Return whether a point has weights in the row."""
-    return at.points.marked[at.points.row_of(node)] == 1
+    return at.features.points.marked[at.features.points.row_of(node)] == 1
 
 
 @ti.func
 def last_row(at: ti.template(), node: ti.template()):
     """Return whether a point has weights in the row, for the last time in a step."""
-    row = at.points.row_of(node)
-    marked = at.points.marked[row]
-    at.points.marked[row] = 0
+    row = at.features.points.row_of(node)
+    marked = at.features.points.marked[row]
+    at.features.points.marked[row] = 0
     return marked == 1

@@ -150,13 +150,6 @@ RANGE = 1.5
 EMPTY, SEVERAL = -1, -2
 
 
-def contact_between(
-    groups: Sequence[ParticleArrays], bodies: Sequence[int], grid: Grid, runs: int = 1
-) -> "ParticleContact | None":
-    """Return the contact of a scene with these numbers of bodies per group, or None without contact."""
-    return ParticleContact(grid, groups[0], runs) if groups[0].total and max(bodies) > 1 else None
-
-
 def bins_along(cells: Sequence[int]) -> tuple[int, ...]:
     """Return the number of bins per axis of a domain, including a margin of one on each side."""
     return tuple(n // BIN + 3 for n in cells)

@@ -9,18 +9,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from mpmcli.boundaries.colliders import ColliderMotion, Colliders
 from mpmcli.boundaries.mirror_images import MirrorImages
-from mpmcli.boundaries.rigid_bodies import RigidBodies
-from mpmcli.boundaries.rigid_contact import RigidContact
 from mpmcli.boundaries.walls import REACH as WALLS_REACH
-from mpmcli.boundaries.walls import MovingFaces, RoughFaces, Walls, faces_on_grid
+from mpmcli.boundaries.walls import Walls, faces_on_grid
 from mpmcli.errors import RunError
 from mpmcli.quick_taichi import ti
-from mpmcli.solver.contact.body_contact import BodyContact
-from mpmcli.solver.contact.collider_points import ColliderPoints
-from mpmcli.solver.contact.total_solids import DRIFT, contact_between, slips_in
-from mpmcli.solver.drive.forces import DriveValues, Gravity, HostValues, RigidDrive, push_on
+from mpmcli.solver.contact.total_solids import DRIFT, slips_in
+from mpmcli.solver.drive.forces import DriveValues, Gravity, HostValues, push_on
 from mpmcli.solver.engine.compiled_kind import CompiledKind
 from mpmcli.solver.engine.cpu_launch import CpuLaunch
 from mpmcli.solver.engine.device import Device
@@ -28,6 +23,7 @@ from mpmcli.solver.engine.gpu_launch import GpuLaunch
 from mpmcli.solver.engine.kernel_store import StoredLaunch
 from mpmcli.solver.engine.run_state import FRAME_NUMBERS, MOST_FRAMES, Layout, RunState
 from mpmcli.solver.engine.step_size import StepSize
+from mpmcli.solver.features import Features
 from mpmcli.solver.frames.reader import sum_entries
 from mpmcli.solver.grid.fixed_point import FixedPoint
 from mpmcli.solver.grid.grid import Grid, drift_allowed, node_width, tile_edge
@@ -41,7 +37,6 @@ from mpmcli.solver.grid.sparse_grid import (
 )
 from mpmcli.solver.machine.backend import Backend
 from mpmcli.solver.particles.arrays import CONSTANTS, ParticleArrays
-from mpmcli.solver.particles.inflow import Emission
 from mpmcli.solver.particles.sort import SortBuffers, TileOrder
 from mpmcli.solver.transfer.node_update import NodeUpdate
 from mpmcli.solver.transfer.particle_update import BEYOND, ParticleUpdate
@@ -120,32 +115,17 @@ class Batch:
         ]
         for group in groups:
             group.repeat(period)
-        friction, moving = RoughFaces(kind.rough, runs), MovingFaces(kind.moving, d, runs)
-        faces = faces_on_grid(kind.faces, kind.settings)
-        walls = Walls(faces, PAD, grid.cells, grid.shape, runs * grid.layers, friction, moving)
-        walls.shut = 0 if kind.layers.shares else -WALLS_REACH
-        images = MirrorImages(walls, scheme.spline.on_node, on_cpu=on_cpu)
         if deterministic:
             grid.fixed = FixedPoint(grid, groups, backend.arch)
         self.sort_buffers = SortBuffers(groups, runs) if sorts else None
         orders = self._make_orders(groups, grid) if sorts else []
-        contact = contact_between(groups, kind.bodies, grid, runs)
-        colliders = motion = rigid = surfaces = points = None
-        if kind.layers.separate:
-            surfaces = BodyContact(groups, orders, grid, kind.layers, runs, backend.threads, on_cpu=on_cpu)
-        emission = Emission(kind.inflow, d, runs) if kind.inflow.groups else None
-        for g, group in enumerate(groups if emission else ()):
-            group.pour_from(emission, tuple(e for e, own in emission.members if own == g))
-        if kind.colliders.count:
-            how = {"on_cpu": on_cpu, "at_rest": kind.settings.solids == "total", "deterministic": deterministic}
-            colliders = Colliders(kind.colliders, d, grid.shape, PAD, runs, **how)
-            colliders.layered, colliders.own = kind.layers.separate, int(not kind.layers.shares)
-            if kind.by_points:
-                colliders.support = scheme.spline.nodes / 2
-                points = ColliderPoints(colliders, grid.node_count, grid.layers, runs)
-            motion = ColliderMotion(colliders, runs) if kind.colliders.moving else None
-            if kind.colliders.free:
-                rigid = RigidBodies(colliders, RigidDrive(d, kind.drives, self.values.device), runs)
+        features = Features(kind, backend, runs, grid, groups, orders, self.values)
+        friction, moving = features.friction, features.moving
+        faces = faces_on_grid(kind.faces, kind.settings)
+        walls = Walls(faces, PAD, grid.cells, grid.shape, runs * grid.layers, friction, moving)
+        walls.shut = 0 if kind.layers.shares else -WALLS_REACH
+        images = MirrorImages(walls, scheme.spline.on_node, on_cpu=on_cpu)
+        watched = sorts and not on_cpu
         self.device = Device(
             runs,
             kind.particles,
@@ -154,24 +134,16 @@ class Batch:
             groups,
             orders,
             walls,
-            friction,
-            moving,
-            NodeUpdate(grid, images, colliders, rigid, points),
+            NodeUpdate(grid, images, features.colliders, features.points),
             ParticleUpdate(
-                grid, kind.faces, runs * len(groups), contact, friction, moving, watches_box=sorts and not on_cpu
+                grid, kind.faces, runs * len(groups), features.repulsion, friction, moving, watches_box=watched
             ),
             self.values,
             Gravity(kind.drives.gravity, [0.0] * d, self.values.device),
-            colliders,
-            motion,
-            rigid,
-            RigidContact(rigid, kind.faces, runs) if rigid else None,
-            emission,
-            surfaces,
-            points,
+            features,
             ti.field(int, shape=(2 * runs, d)) if on_cpu else None,
             sorts,
-            self._drift_allowed(grid, contact is not None),
+            self._drift_allowed(grid, repels=features.repulsion is not None),
         )
         internal = [len(law.internal) for law in kind.members]
         self.layout = Layout(d, internal, len(kind.inflow.groups), kind.bodies)
@@ -182,15 +154,15 @@ class Batch:
         self.profile: Counter | None = None
         self.frame_buffer = self._buffer = np.zeros((runs, 1), groups[0].real)
         if on_cpu:
-            noted = len(FRAME_NUMBERS) + len(groups) * sum_entries(d) + sum(one.noted for one in self.device.features)
+            noted = len(FRAME_NUMBERS) + len(groups) * sum_entries(d) + sum(one.noted for one in features)
             self.frame_stats = np.zeros((runs, MOST_FRAMES, noted))
             self._build_cpu()
         else:
             self.gpu = GpuLaunch(self.device, self.layout, doubles=backend.doubles)
 
-    def _drift_allowed(self, grid: Grid, has_contact: bool) -> float:
+    def _drift_allowed(self, grid: Grid, *, repels: bool) -> float:
         """Return the largest drift of particles before a sort, cells."""
-        if has_contact:
+        if repels:
             return DRIFT
         if self.backend.on_cpu:
             return drift_allowed(grid.tile, grid.scheme.spline.nodes)
@@ -253,10 +225,12 @@ class Batch:
         grid = self._make_grid(device.grid.period, min(GROWTH * blocks, most))
         nodes, particles = copy(device.nodes), copy(device.particles)
         nodes.grid = particles.grid = particles.near = grid
+        features = copy(device.features)
         if nodes.points is not None:
-            nodes.points = nodes.points.on(grid.node_count)
+            features.points = nodes.points = nodes.points.on(grid.node_count)
         orders = self._make_orders(device.groups, grid)
-        self.device = replace(device, grid=grid, orders=orders, nodes=nodes, particles=particles, points=nodes.points)
+        how = {"grid": grid, "orders": orders, "nodes": nodes, "particles": particles, "features": features}
+        self.device = replace(device, **how)
         self._build_cpu()
 
     def _build_cpu(self) -> None:

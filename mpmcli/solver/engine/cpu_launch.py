@@ -197,10 +197,10 @@ class CpuLaunch:
         high = ti.Vector([-1] * self.dimension)
         self.emission.count_active(run)
         if ti.static(self.phases.separates):
-            self.device.contact.surfaces.forget(run.w)
+            self.device.features.surfaces.forget(run.w)
         (view,) = ti.static(self.phases.see(run))
-        if ti.static(self.device.particles.has_contact):
-            self.device.particles.contact.fill(run.w, run.w * self.capacity[0], run.particles[0], view.grid.spacing)
+        if ti.static(self.device.particles.repels):
+            self.device.features.repulsion.fill(run.w, run.w * self.capacity[0], run.particles[0], view.grid.spacing)
         for g in ti.static(range(len(self.members))):
             first, own = run.w * ti.static(self.capacity[g]), run.particles[g]
             for p in range(first, first + own):
@@ -208,7 +208,7 @@ class CpuLaunch:
                 low, high = ti.min(low, base), ti.max(high, base)
                 if ti.static(self.phases.separates):
                     layer = run.w * ti.static(self.device.grid.layers) + view.groups[g].layer_of(p)
-                    self.device.contact.surfaces.widen(layer, base)
+                    self.device.features.surfaces.widen(layer, base)
             if ti.static(self.phases.shared):
                 self.phases.places.divide(g, own)
         if ti.static(self.device.comes_and_goes):

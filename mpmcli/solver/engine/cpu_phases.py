@@ -11,11 +11,13 @@ of the run again.
 from collections.abc import Callable
 from typing import NamedTuple
 
+from mpmcli.boundaries.feature import Phase
 from mpmcli.boundaries.mirror_images import find_friction
 from mpmcli.quick_taichi import ti
+from mpmcli.solver.contact.contact_phases import clear_part
 from mpmcli.solver.engine.device import Device, RunPhases, RunView, Work
 from mpmcli.solver.engine.run_state import Layout
-from mpmcli.solver.engine.step import Phase, sorted_fields
+from mpmcli.solver.engine.step import sorted_fields
 from mpmcli.solver.frames.reader import show_range
 from mpmcli.solver.grid.grid import clear_blocks, clear_rows
 from mpmcli.solver.grid.sparse_grid import BLOCKS, PENCILS
@@ -58,6 +60,7 @@ class PartKind(NamedTuple):
         group: index of the group of particles.
         first, after: number of the first phase, and of the one after the last.
         body: name of the method.
+        part: function of a part, in place of a method.
         item: function for each node or particle, for methods that only loop.
         wanted: function that tells whether a row of nodes has work, see `Phase`.
     """
@@ -67,8 +70,9 @@ class PartKind(NamedTuple):
     first: int
     after: int
     body: str
+    part: Callable | None
     item: Callable | None
-    wanted: Callable | None = None
+    wanted: Callable | None
 
 
 class Part(Work):
@@ -233,7 +237,7 @@ class CpuPhases(RunPhases):
         self.kinds: tuple[PartKind, ...] = ()
         coloured, end = [], 0
         for phase in device.phases:
-            length = self.passes if phase.adds else phase.turns
+            length = self.passes if phase.adds else phase.turns * phase.rounds
             if self.kinds and not phase.adds and self.kinds[-1].name == phase.name:
                 end -= 1
             end = self._add(phase.name, phase.group, end, length, phase)
@@ -266,10 +270,11 @@ class CpuPhases(RunPhases):
     def _add(self, name: str, group: int, first: int, length: int, phase: Phase | None = None) -> int:
         """Number phases, and return the number after the last."""
         item, body = phase and (phase.ranged or phase.body), name
-        if item and phase.over != "rows":
+        if item:
             body = "each_node" if phase.over == "nodes" else "each_in_pencils" if phase.adds else "each_particle"
             body = "shift_nodes" if body == "each_node" and phase.shifts else body
-        self.kinds += (PartKind(name, group, first, first + length, body, item, phase and phase.wanted),)
+        functions = (phase.part, item, phase.wanted) if phase else (None, None, None)
+        self.kinds += (PartKind(name, group, first, first + length, body, *functions),)
         return first + length
 
     def body(self, kind: PartKind) -> object:
@@ -341,7 +346,10 @@ class CpuPhases(RunPhases):
             (view,) = ti.static(self.see(run))
             turn = phase - ti.static(self.kinds[k].first)
             (at,) = ti.static((Part(view, self.kinds[k], turn, region, part, t, frame_buffer),))
-            ti.static(self.body(self.kinds[k]))(at)
+            if ti.static(self.kinds[k].part):
+                ti.static(self.kinds[k].part)(self, at)
+            else:
+                ti.static(self.body(self.kinds[k]))(at)
         if ti.static(k + 1 < len(self.kinds)):
             if ti.static(self.apart):
                 if phase < 0:
@@ -420,9 +428,7 @@ class CpuPhases(RunPhases):
                 (inner,) = ti.static((at.in_layer(layer, own),))
                 clear_rows(inner.grid, first, after)
             if ti.static(self.separates):
-                (near,) = ti.static(self.near_bodies(at))
-                first, after = self.rows_near_bodies(near, at)
-                self.device.contact.surfaces.clear_rows(near, at.w, first, after)
+                clear_part(self, at)
 
     @ti.func
     def pencils(self, order: ti.template(), colour: int, region: int, part: int):
@@ -529,21 +535,6 @@ class CpuPhases(RunPhases):
         ti.atomic_max(at.step.speed_squared, speed_squared)
 
     @ti.func
-    def meet(self, at: ti.template()):
-        """Find the velocities of rigid bodies: sum the impulses of points in even turns, and solve in odd turns."""
-        if at.turn % 2 == 0:
-            self.each_node(at)
-        elif at.region == 0 and at.part == 0:
-            at.nodes.rigid.solve(at.w, at.run.dt)
-
-    @ti.func
-    def move_bodies(self, at: ti.template()):
-        """Move rigid bodies, including the momentum transferred from nodes."""
-        if at.region == 0 and at.part == 0:
-            for turn in ti.static(range(3)):
-                self.move_rigid(at, turn)
-
-    @ti.func
     def advance(self, at: ti.template()):
         """Gather and move particles of the g-th group."""
         dt, gravity_step = at.step.dt, self.gravity_of(at.step)
@@ -557,50 +548,6 @@ class CpuPhases(RunPhases):
             first, after = self.share(first, after, at.part)
             rate = advance_range(at.particles, at.g, self.device.groups[at.g], first, after, dt, gravity_step)
             ti.atomic_max(at.step.rate[at.g], rate)
-
-    # Bodies with their own velocity fields, see `contact.body_contact`.
-
-    @ti.func
-    def rows_near_bodies(self, grid: ti.template(), at: ti.template()):
-        """Return the first row of a part of the nodes where bodies may be in contact, and the one after the last."""
-        first, after = self.places.even_part(grid.row_count(), at.region)
-        return self.share(first, after, at.part)
-
-    @ti.func
-    def find_bodies(self, at: ti.template()):
-        """Find the nodes where bodies are in contact."""
-        (grid,) = ti.static(self.near_bodies(at))
-        (obstacles,) = ti.static((at.obstacles(),))
-        first, after = self.rows_near_bodies(grid, at)
-        self.device.contact.surfaces.find_rows(grid, obstacles, at.w, first, after)
-
-    @ti.func
-    def show_surface(self, at: ti.template()):
-        """Find the surface data of particles of the g-th group."""
-        (grid,) = ti.static(self.near_bodies(at))
-        first, after = self.places.even_part(self.device.contact.surfaces.tile_count(grid, at.w), at.region)
-        first, after = self.share(first, after, at.part)
-        for q in range(first, after):
-            self.device.contact.surfaces.show(at.g, grid, at.w, q)
-
-    @ti.func
-    def link_surfaces(self, at: ti.template()):
-        """Insert the surface data of particles into the bins of their nodes, in order, on one thread."""
-        if at.region == 0 and at.part == 0:
-            (grid,) = ti.static(self.near_bodies(at))
-            for q in range(self.device.contact.surfaces.tile_count(grid, at.w)):
-                for g in ti.static(self.device.contact.surfaces.surfaced):
-                    self.device.contact.surfaces.link(g, grid, at.w, q)
-
-    @ti.func
-    def exchange(self, at: ti.template()):
-        """Exchange momentum between bodies in contact at nodes, and with walls and colliders."""
-        (grid,) = ti.static(self.near_bodies(at))
-        (obstacles,) = ti.static((at.obstacles(),))
-        gravity_step = self.gravity_of(at.step)
-        first, after = self.rows_near_bodies(grid, at)
-        thread = at.w * ti.static(self.regions) + at.t
-        self.device.contact.exchange_rows(grid, obstacles, at.w, thread, first, after, at.step.dt, gravity_step)
 
     # Sorts and frames.
 

@@ -6,21 +6,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mpmcli.boundaries.colliders import ColliderMotion, Colliders
-from mpmcli.boundaries.feature import Feature
-from mpmcli.boundaries.rigid_bodies import RigidBodies
-from mpmcli.boundaries.rigid_contact import RigidContact
-from mpmcli.boundaries.walls import MovingFaces, RoughFaces, Walls
+from mpmcli.boundaries.feature import Phase, changed
+from mpmcli.boundaries.walls import Walls
 from mpmcli.quick_taichi import ti
-from mpmcli.solver.contact.body_contact import BodyContact
-from mpmcli.solver.contact.collider_points import ColliderPoints
-from mpmcli.solver.contact.surfaces import Obstacles
 from mpmcli.solver.drive.forces import DriveValues, Gravity
 from mpmcli.solver.engine.run_state import Layout, RunState, StepState
-from mpmcli.solver.engine.step import Phase, step_phases
+from mpmcli.solver.engine.step import step_phases
+from mpmcli.solver.features import Features
 from mpmcli.solver.grid.grid import Grid
 from mpmcli.solver.particles.arrays import ParticleArrays
-from mpmcli.solver.particles.inflow import Emission
 from mpmcli.solver.particles.sort import TileOrder
 from mpmcli.solver.particles.state_bounds import NOTHING
 from mpmcli.solver.transfer.node_update import NodeUpdate
@@ -39,15 +33,9 @@ class Device:
         grid: the grid.
         groups, orders: particles and tile order of each law, for all runs.
         walls: the walls.
-        friction, moving: coefficients of friction and velocities of the walls of each run.
         nodes, particles: updates of nodes and particles.
-        colliders, motion: colliders of each run, and their motion; None if there are none.
-        rigid, rigid_contact: freely moving rigid bodies, and their contact with other objects than material; None if
-            there are none.
         values, gravity: numbers for expressions, and varying gravity.
-        emission: mouths of emitters; None if there are none.
-        contact: contact of bodies with their own layers of nodes; None if all share one layer.
-        points: contact with colliders at points of their surfaces; None if there is none.
+        features: the features that scenes may have or lack.
         stencils: (2 runs, d) int, per run the smallest and largest first node of a stencil per axis at the last sort;
             None on a GPU.
         sorts: whether particles are sorted; several small runs on a GPU instead use all nodes of their domains.
@@ -61,19 +49,11 @@ class Device:
     groups: Sequence[ParticleArrays]
     orders: Sequence[TileOrder]
     walls: Walls
-    friction: RoughFaces
-    moving: MovingFaces
     nodes: NodeUpdate
     particles: ParticleUpdate
     values: DriveValues
     gravity: Gravity
-    colliders: Colliders | None = None
-    motion: ColliderMotion | None = None
-    rigid: RigidBodies | None = None
-    rigid_contact: RigidContact | None = None
-    emission: Emission | None = None
-    contact: BodyContact | None = None
-    points: ColliderPoints | None = None
+    features: Features
     stencils: ti.Field | None = None
     sorts: bool = True
     drift_allowed: float = 1.0
@@ -84,23 +64,10 @@ class Device:
         return self.groups[0].comes_and_goes
 
     @property
-    def features(self) -> tuple[Feature, ...]:
-        """The features of the scene, in the order in which they are written, and their values stored and named."""
-        walls, colliders = (self.friction, self.moving, self.grid.period), (self.colliders, self.motion)
-        bodies = self.rigid, self.rigid_contact, self.contact, self.points, self.particles.contact
-        return tuple(one for one in (*walls, *colliders, *bodies) if one is not None)
-
-    @property
     def phases(self) -> tuple[Phase, ...]:
         """The phases of a step."""
-        return step_phases(self.groups, self.nodes, self.contact, serial=self.stencils is not None)
-
-
-def _changed(thing: object, **attributes: object) -> object:
-    result = copy(thing)
-    for name, value in attributes.items():
-        setattr(result, name, value)
-    return result
+        pressed, serial = self.features.surfaces is None or self.features.surfaces.shares, self.stencils is not None
+        return step_phases(self.groups, self.nodes, self.features, pressed=pressed, serial=serial)
 
 
 class RunView:
@@ -110,7 +77,7 @@ class RunView:
         run, step: numbers of the run and of its step.
         w: index of the run.
         grid, nodes, particles: grid of the run, and updates of its nodes and particles.
-        points: contact at points of the surfaces of colliders, or None.
+        features: the features of the run.
         orders, groups: tile order and particles of each law.
     """
 
@@ -139,10 +106,10 @@ class RunView:
         """
         w, fixed, fine = run.w, device.grid.fixed, device.grid.fine
         self.run, self.step, self.w = run, step, w
-        self.grid = _changed(
+        self.grid = changed(
             device.grid,
-            fixed=None if fixed is None else _changed(fixed, run=w),
-            fine=None if fine is None else _changed(fine, first_node=w * fine.node_count),
+            fixed=None if fixed is None else changed(fixed, run=w),
+            fine=None if fine is None else changed(fine, first_node=w * fine.node_count),
             spacing=h,
             inverse_spacing=inverse,
             gradient_scale=scale,
@@ -150,22 +117,14 @@ class RunView:
             first_node=w * (device.grid.layers * device.grid.node_count),
             period=device.grid.period.seen_from(w),
         )
-        friction = _changed(device.friction, first=w * len(device.friction.faces))
-        moving = _changed(device.moving, first=w * len(device.moving.faces))
-        walls = _changed(device.walls, last=last, friction=friction, moving=moving)
+        device.features.viewed(self)
+        friction, moving, colliders = self.features.friction, self.features.moving, self.features.colliders
+        walls = changed(device.walls, last=last, friction=friction, moving=moving)
         walls.first_plane = w * (device.grid.layers * len(walls.separating))
         walls.first_rough = w * (device.grid.layers * len(walls.rough))
-        images = _changed(device.nodes.images, walls=walls)
-        colliders, rigid, points = device.colliders, device.rigid, device.points
-        if colliders is not None:
-            colliders = _changed(colliders, run=w, spacing=h)
-        if rigid is not None:
-            rigid = _changed(rigid, run=w, colliders=colliders)
-        if points is not None:
-            points = points.seen_from(w, colliders)
-        shared = {"colliders": colliders, "rigid": rigid, "points": points}
-        self.nodes, self.points = _changed(device.nodes, grid=self.grid, images=images, **shared), points
-        self.particles = _changed(
+        images, points = changed(device.nodes.images, walls=walls), self.features.points
+        self.nodes = changed(device.nodes, grid=self.grid, images=images, colliders=colliders, points=points)
+        self.particles = changed(
             device.particles,
             grid=self.grid,
             near=self.grid,
@@ -177,7 +136,7 @@ class RunView:
             run=w,
         )
         self.orders = tuple(
-            _changed(order, grid=self.grid, extent=extent, first_tile=w * (order.bins + 1)) for order in device.orders
+            changed(order, grid=self.grid, extent=extent, first_tile=w * (order.bins + 1)) for order in device.orders
         )
         self.groups = tuple(
             group.seen_from(w) if group.is_pushed or group.repeats else group for group in device.groups
@@ -188,7 +147,7 @@ class Work:
     """The work of a thread in a phase, with the view of its run.
 
     Attributes:
-        run, step, grid, nodes, particles, points: see `RunView`.
+        run, step, grid, nodes, particles, features: see `RunView`.
         order, group: tile order and fields of the group of particles.
         item: function for each node or particle.
         g: index of the group.
@@ -198,7 +157,7 @@ class Work:
 
     def __init__(self, view: RunView, g: int, item: Callable | None, turn: object) -> None:
         self.run, self.step, self.w = view.run, view.step, view.w
-        self.grid, self.nodes, self.particles, self.points = view.grid, view.nodes, view.particles, view.points
+        self.grid, self.nodes, self.particles, self.features = view.grid, view.nodes, view.particles, view.features
         self.g, self.group, self.order = g, view.groups[g], view.orders[g] if view.orders else None
         self.item, self.turn = item, turn
 
@@ -211,10 +170,6 @@ class Work:
         view.nodes = self.nodes.in_layer(view.grid, layer)
         return view
 
-    def obstacles(self) -> Obstacles:
-        """Return the walls and colliders of the run."""
-        return Obstacles(self.nodes.images.walls, self.nodes.colliders, self.grid.spacing)
-
 
 @ti.data_oriented
 class RunPhases:
@@ -223,16 +178,16 @@ class RunPhases:
     Attributes:
         values: numbers of the step of each run, see `run_state.STEP`.
         members: (index, group) of each law.
-        moves, rigid: whether colliders move as prescribed, and whether any moves freely.
-        separates: whether bodies have their own velocity fields, see `contact.body_contact`.
+        separates: whether bodies have their own velocity fields.
         touches: whether colliders act at points of their surfaces.
+        beginning: the features with work at the begin of a step.
     """
 
     def __init__(self, device: Device, layout: Layout) -> None:
         self.device, self.layout, self.dimension = device, layout, device.grid.dimension
         self.members = tuple(enumerate(device.groups))
-        self.moves, self.rigid = device.motion is not None, device.rigid is not None
-        self.separates, self.touches = device.contact is not None, device.points is not None
+        self.separates, self.touches = device.features.surfaces is not None, device.features.points is not None
+        self.beginning = tuple(feature for feature in device.features if feature.begins)
         self.values = ti.field(float, shape=(device.runs, layout.widths["step"]))
 
     def state(self, w: object, numbers: object, counts: object) -> RunState:
@@ -262,29 +217,16 @@ class RunPhases:
         else:
             for a in ti.static(range(self.dimension)):
                 step.gravity[a] = step.kick * ti.cast(run.gravity[a], float)
-        if ti.static(self.moves):
-            self.device.values.set_motions(run.w, self.device.motion, run.time, run.time + run.dt)
-            self.device.motion.advance(run.w, run.dt)
-        if ti.static(self.rigid):
-            self.device.rigid.begin(run.w, run.dt, step.kick, self.gravity_of(step))
         self.forget_extremes(step, run.w)
-        if ti.static(self.separates):
-            self.find_meetings(run)
-
-    @ti.func
-    def find_meetings(self, run: ti.template()):
-        """Find where bodies may be in contact in a step, with the current positions of colliders."""
-        drift = ti.cast(ti.ceil(run.drift), int)
-        (view,) = ti.static(self.see(run))
-        (obstacles,) = ti.static((Obstacles(view.nodes.images.walls, view.nodes.colliders, view.grid.spacing),))
-        self.device.contact.surfaces.find_box(self.device.grid, obstacles, run.w, drift, view.particles.last)
+        for feature in ti.static(self.beginning):
+            feature.begin_step(self, run, step)
 
     @ti.func
     def layer_count(self, at: ti.template()):
         """Return the number of layers as a run-time value, so that compilers do not unroll loops over layers."""
         count = 1
         if ti.static(self.separates):
-            count = self.device.contact.surfaces.count[at.w]
+            count = self.device.features.surfaces.count[at.w]
         return count
 
     @ti.func
@@ -293,23 +235,15 @@ class RunPhases:
         own = ti.Matrix.zero(int, 2, self.dimension)
         if ti.static(self.separates):
             for i, a in ti.static(ti.ndrange(2, self.dimension)):
-                own[i, a] = self.device.contact.surfaces.used[(at.w * ti.static(at.grid.layers) + layer) * 2 + i, a]
+                own[i, a] = self.device.features.surfaces.used[(at.w * ti.static(at.grid.layers) + layer) * 2 + i, a]
         return own
-
-    @ti.func
-    def near_bodies(self, at: ti.template()):
-        """Return, in a tuple, the view of the grid restricted to the box in which bodies may be in contact."""
-        box = ti.Matrix.zero(int, 2, self.dimension)
-        for i, a in ti.static(ti.ndrange(2, self.dimension)):
-            box[i, a] = self.device.contact.surfaces.box[at.w * 2 + i, a]
-        return ti.static((at.grid.within(box),))
 
     @ti.func
     def forget_extremes(self, step: ti.template(), w: int):
         """Reset the largest speed and rates of a step of run w, and its number of points on colliders."""
         step.speed_squared, step.broken = 0.0, 0.0
         if ti.static(self.touches):
-            self.device.points.count[w] = 0
+            self.device.features.points.count[w] = 0
         for g in ti.static(range(len(self.members))):
             # A law may not have particles yet.
             step.rate[g] = 0.0 if ti.static(self.device.comes_and_goes) else NOTHING
@@ -344,19 +278,6 @@ class RunPhases:
                 box[i, a] = self.device.grid.box[run.w * 2 + i, a]
         h, inverse, scale = step.spacing, step.inverse_spacing, step.gradient_scale
         return ti.static((RunView(self.device, run, step, h, inverse, scale, box, last, extent),))
-
-    @ti.func
-    def move_rigid(self, at: ti.template(), turn: ti.template()):
-        """Transfer momentum from nodes to rigid bodies (turn 0), resolve their contact (1), or move them (2)."""
-        if ti.static(turn == 0):
-            at.nodes.rigid.take(at.w, at.run.dt)
-        if ti.static(turn == 1):
-            self.device.rigid_contact.resolve(at.w, at.run.dt, at.particles.extent, at.nodes.colliders)
-        if ti.static(turn == 2):
-            fastest, finite = at.nodes.rigid.move(at.w, at.run.dt)
-            ti.atomic_max(at.step.speed_squared, fastest)
-            if not finite:
-                at.step.broken = 1.0
 
     @ti.func
     def gravity_of(self, step: ti.template()):

@@ -29,11 +29,12 @@ class CpuEmission:
 
     def __init__(self, device: Device, stencils: ti.Field) -> None:
         """Store the device; `stencils` holds, per run and axis, the range of first nodes of stencils."""
-        self.stencils, self.separates = stencils, device.contact is not None
-        self.device, self.emission = device, device.emission
-        self.needed = device.emission is not None
+        self.stencils, self.separates = stencils, device.features.surfaces is not None
+        self.device, self.emission = device, device.features.emission
+        self.needed = device.features.emission is not None
         # Per emitter: its index, the index of its law, and its group of particles.
-        self.emitters = tuple((e, g, device.groups[g]) for e, g in (device.emission.members if self.needed else ()))
+        members = self.emission.members if self.needed else ()
+        self.emitters = tuple((e, g, device.groups[g]) for e, g in members)
         self.numbered = tuple(enumerate(device.groups))
 
     @ti.func
@@ -81,7 +82,7 @@ class CpuEmission:
             self.stencils[w * 2 + 1, a] = ti.max(self.stencils[w * 2 + 1, a], base[a])
         if ti.static(self.separates):
             # Emitted particles are in layer 0.
-            self.device.contact.surfaces.widen(w * ti.static(self.device.grid.layers), base)
+            self.device.features.surfaces.widen(w * ti.static(self.device.grid.layers), base)
 
     @ti.func
     def is_left(self, e: ti.template(), run: ti.template()):
@@ -120,7 +121,7 @@ class GpuEmission:
     """
 
     def __init__(self, device: Device, layout: Layout, counts: ti.Field) -> None:
-        self.device, self.emission, self.counts, self.runs = device, device.emission, counts, device.runs
+        self.device, self.emission, self.counts, self.runs = device, device.features.emission, counts, device.runs
         self.layout, self.capacity = layout, tuple(device.capacity)
         self.members = tuple(enumerate(device.groups))
         self.enters, self.sheet, self.blocked, self.layer = (ti.field(int, shape=self.runs) for _ in range(4))
@@ -224,9 +225,9 @@ def begin_emission(batch: object, slot: int, scene: Scene, particles: Sequence[i
     """
     run = batch.state(slot)
     run.slowest = max((highest_speed(emitter, scene.time.end) for emitter in scene.emitters), default=0.0)
-    if batch.device.emission is None:
+    if batch.device.features.emission is None:
         return
-    found = batch.device.emission.write(scene, first_ids(scene, particles), slot)
+    found = batch.device.features.emission.write(scene, first_ids(scene, particles), slot)
     for e, (sheets, emitter) in enumerate(zip(found, scene.emitters, strict=True)):
         # A sheet enters at the first step after its due time; no sheet is due from `until` on.
         start = float(sheets.due[0]) if sheets.count else emitter.start

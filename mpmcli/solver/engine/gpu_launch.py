@@ -14,14 +14,14 @@ from collections.abc import Callable
 import numpy as np
 
 from mpmcli.boundaries.doubles import as_double, double_field
+from mpmcli.boundaries.feature import Phase
 from mpmcli.boundaries.mirror_images import find_friction
-from mpmcli.boundaries.rigid_bodies import ROUNDS
 from mpmcli.quick_taichi import ti
 from mpmcli.solver.drive.forces import HostValues
 from mpmcli.solver.engine.device import Device, RunPhases, RunView, Work
 from mpmcli.solver.engine.emission import GpuEmission
 from mpmcli.solver.engine.run_state import ATTEND, GOING, MEASURE, Layout, RunState
-from mpmcli.solver.engine.step import Phase, sorted_fields
+from mpmcli.solver.engine.step import sorted_fields
 from mpmcli.solver.engine.step_size import StepSize
 from mpmcli.solver.frames.columns import FrameColumns
 from mpmcli.solver.frames.reader import chosen_columns, show_range
@@ -101,7 +101,10 @@ class GpuPhases(RunPhases):
         (run,) = ti.static((self.run(w),))
         (view,) = ti.static(self.see(run))
         (at,) = ti.static((Item(view, phase, turn, q, self.peaks),))
-        ti.static(self.body(phase))(at)
+        if ti.static(phase.item):
+            ti.static(phase.item)(self, at)
+        else:
+            ti.static(self.body(phase))(at)
 
     def body(self, phase: Phase) -> object:
         """Return the method of a phase."""
@@ -133,6 +136,12 @@ class GpuPhases(RunPhases):
             self.in_layers(at, at.grid.box_node(at.q), self.do_item)
 
     @ti.func
+    def each_row(self, at: ti.template()):
+        """Apply the function of a phase to the nodes of a row."""
+        if at.q < at.grid.row_count():
+            nodes_of_rows(at, at.q, at.q + 1, at.step.kick)
+
+    @ti.func
     def do_item(self, at: ti.template(), node: ti.template()):
         """Apply the function of a phase to a node of a layer."""
         ti.static(at.item)(at, node, at.step.kick)
@@ -156,8 +165,8 @@ class GpuPhases(RunPhases):
             node = at.grid.box_node(at.q)
             self.in_layers(at, node, self.clear_node)
             if ti.static(self.separates):
-                place = self.device.contact.surfaces.place_of(at.grid, at.w, at.grid.linear_index(node))
-                self.device.contact.surfaces.clear(place)
+                place = self.device.features.surfaces.place_of(at.grid, at.w, at.grid.linear_index(node))
+                self.device.features.surfaces.clear(place)
 
     @ti.func
     def clear_node(self, at: ti.template(), node: ti.template()):
@@ -226,25 +235,11 @@ class GpuPhases(RunPhases):
         self.peaks.include(at.w, 0, squared)
 
     @ti.func
-    def meet(self, at: ti.template()):
-        """Find the velocities of rigid bodies: sum the impulses of points in even turns, and solve in odd turns."""
-        if ti.static(at.turn % 2 == 0):
-            if at.q < at.grid.row_count():
-                nodes_of_rows(at, at.q, at.q + 1, at.step.kick)
-        elif at.q == 0:
-            at.nodes.rigid.solve(at.w, at.run.dt)
-
-    @ti.func
-    def move_bodies(self, at: ti.template()):
-        """Move rigid bodies, in three turns."""
-        self.move_rigid(at, at.turn)
-
-    @ti.func
     def add_loads(self, at: ti.template()):
         """Sum the loads of the nodes of a row on a collider, in order."""
         at.nodes.colliders.add_row(at.q)
         if ti.static(at.nodes.touches):
-            at.points.add_row(at.grid, at.q)
+            at.features.points.add_row(at.grid, at.q)
 
     @ti.func
     def advance(self, at: ti.template()):
@@ -253,58 +248,6 @@ class GpuPhases(RunPhases):
         (particles,) = ti.static((self.beside(at, layer),))
         rate = particles.advance(at.g, self.device.groups[at.g], at.q, at.step.dt, self.gravity_of(at.step))
         self.peaks.include(at.w, 1 + 2 * at.g, rate)
-
-    # Bodies with their own velocity fields, see `contact.body_contact`.
-
-    @ti.func
-    def find_bodies(self, at: ti.template()):
-        """Find which bodies are at a node, and whether they are in contact."""
-        (grid,) = ti.static(self.near_bodies(at))
-        (obstacles,) = ti.static((at.obstacles(),))
-        if at.q < grid.box_nodes():
-            self.device.contact.surfaces.find(grid, obstacles, at.w, grid.box_node(at.q))
-
-    @ti.func
-    def show_surface(self, at: ti.template()):
-        """Find the surface data of a particle."""
-        (grid,) = ti.static(self.near_bodies(at))
-        self.device.contact.surfaces.count_particle(at.g, grid, at.w, at.q)
-
-    @ti.func
-    def reserve(self, at: ti.template()):
-        """Reserve space for the surface data at a node."""
-        self.at_bins(at, self.device.contact.surfaces.reserve)
-
-    @ti.func
-    def put(self, at: ti.template()):
-        """Store a particle in its reserved space."""
-        (grid,) = ti.static(self.near_bodies(at))
-        self.device.contact.surfaces.put(at.g, grid, at.w, at.q)
-
-    @ti.func
-    def chain(self, at: ti.template()):
-        """Make lists of the surface data at a node."""
-        self.at_bins(at, self.device.contact.surfaces.chain)
-
-    @ti.func
-    def at_bins(self, at: ti.template(), do: ti.template()):
-        """Call `do` for the bins of a node where bodies may be in contact."""
-        (grid,) = ti.static(self.near_bodies(at))
-        if at.q < grid.box_nodes():
-            place = self.device.contact.surfaces.place_of(grid, at.w, grid.linear_index(grid.box_node(at.q)))
-            ti.static(do)(at.w, place)
-
-    @ti.func
-    def exchange(self, at: ti.template()):
-        """Exchange momentum between bodies at some nodes, and with walls and colliders."""
-        (grid,) = ti.static(self.near_bodies(at))
-        obstacles, threads = ti.static((at.obstacles(), self.device.contact.threads))
-        gravity_step, q = self.gravity_of(at.step), at.q
-        while q < grid.box_nodes():
-            node = grid.box_node(q)
-            index, thread = grid.linear_index(node), at.w * threads + at.q
-            self.device.contact.exchange_all(grid, obstacles, at.w, thread, node, index, at.step.dt, gravity_step)
-            q += threads
 
     # Work outside of steps.
 
@@ -353,14 +296,12 @@ class GpuPhases(RunPhases):
 
 # Largest number of steps of a launch, after which the host handles the runs that need it.
 STEPS = 32
-# Launches of a step: the shift of particles, in few steps; all other phases, or with rigid bodies those before "meet";
-# one round of "meet". Each turn of a later phase is a launch of its own, because drivers may take minutes to compile
-# phases of rigid bodies together with others.
+# Launches of a step: the shift of particles, in few steps; all other phases, or if one has rounds those before it; a
+# round of this one. Each turn of a later phase is a launch of its own, because drivers may take minutes to compile
+# these phases together with others.
 SHIFT, FIRST, ROUND = range(3)
-# Turns on a GPU of a round of "meet", and of the phase that moves bodies.
-TURNS = {"meet": 2, "move_bodies": 3}
 # Items of phases other than particles, see `Phase`.
-OVER = ("nodes", "planes", "rows", "loads", "bodies", "threads")
+OVER = ("nodes", "planes", "rows", "loads", "runs", "threads")
 
 
 @ti.data_oriented
@@ -386,8 +327,9 @@ class GpuLaunch:
         self.steps = StepSize.of(device, layout, device.values if doubles else HostValues(device.values))
         self.sorts, self.moved = device.sorts, sorted_fields(groups)
         self.averages = any(group.uses_f_bar for group in groups)
-        self.loads = device.colliders.loads.rows * device.colliders.loads.capacity if device.nodes.collides else 0
-        self.threads = device.contact.threads if device.contact is not None else 0
+        loads = device.features.colliders and device.features.colliders.loads
+        self.loads = loads.rows * loads.capacity if loads else 0
+        self.threads = max((feature.threads for feature in device.features), default=0)
         runs, self.widest = self.runs, max(entries(group) for group in groups)
         self.workers = max(1, GPU_WORKERS // runs)
         self.counts, self.numbers = self.phases.counts, self.phases.numbers
@@ -396,7 +338,7 @@ class GpuLaunch:
         self.reach = ti.field(int, shape=len(OVER))
         self.maxima = Maxima(runs, len(groups) * self.widest)
         self.stencils = ti.field(int, shape=(2 * runs, self.dimension))
-        self.emission = GpuEmission(device, layout, self.counts) if device.emission is not None else None
+        self.emission = GpuEmission(device, layout, self.counts) if device.features.emission else None
         self.readers = [self._reader(g) for g in range(len(groups))]
         self.compile_seconds = 0.0
         self._called: set[tuple] = set()
@@ -461,10 +403,8 @@ class GpuLaunch:
         if shifts:
             self._call(self.step, SHIFT)
         self._call(self.step, FIRST)
-        if self.phases.rigid:
-            for _ in range(ROUNDS):
-                self._call(self.step, ROUND)
-            for part in range(ROUND + 1, len(self.parts)):
+        for part in range(ROUND, len(self.parts)):
+            for _ in range(self.parts[part][0][0].rounds):
                 self._call(self.step, part)
 
     def _call(self, kernel: Callable, *arguments: int) -> None:
@@ -479,10 +419,10 @@ class GpuLaunch:
         """Return the phases of each launch of a step, with their turns."""
         parts: list[list[tuple[Phase, int]]] = [[], []]
         for phase in self.device.phases:
-            turns = [(phase, turn) for turn in range(TURNS.get(phase.name, phase.turns))]
+            turns = [(phase, turn) for turn in range(phase.turns)]
             if phase.shifts:
                 parts[SHIFT] += turns
-            elif phase.name == "meet":
+            elif phase.rounds > 1:
                 parts.append(turns)
             elif len(parts) == ROUND:
                 parts[FIRST] += turns
@@ -686,7 +626,7 @@ class GpuLaunch:
         if ti.static(self.phases.separates):
             for w in range(self.runs):
                 if self.sorting[w] == 1:
-                    self.device.contact.surfaces.forget(w)
+                    self.device.features.surfaces.forget(w)
         if ti.static(self.sorts):
             for g, _group in ti.static(self.members):
                 for p in range(self.runs * self.capacity[g]):
@@ -694,7 +634,7 @@ class GpuLaunch:
                     if self.sorting[w] == 1 and self.takes_part(g, w, p):
                         base = self.phases.first_node_of(g, w, p)
                         if ti.static(self.phases.separates):
-                            self.device.contact.surfaces.widen(self.phases.layer_of(g, w, p), base)
+                            self.device.features.surfaces.widen(self.phases.layer_of(g, w, p), base)
                         for a in ti.static(range(self.dimension)):
                             # The comparisons may use old values; they avoid most atomic operations.
                             if base[a] < self.stencils[2 * w, a]:

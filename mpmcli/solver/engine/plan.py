@@ -20,26 +20,6 @@ from mpmcli.solver.grid.grid import Grid
 from mpmcli.solver.machine.backend import LARGEST_INDEX, MEMORY_SHARE, Backend, free_memory
 from mpmcli.solver.machine.dry_run import DryField, fields_of
 
-# Names of the phases of every step in messages; the phases that relax volumes, which run in some steps only, are left
-# out.
-WORDS = {
-    "clear": "clear grid",
-    "average": "average volumes of {}",
-    "scatter": "scatter {}",
-    "to_float": "read sums in fixed point",
-    "find_bodies": "find bodies that meet",
-    "exchange": "let bodies push each other",
-    "find_contact": "find contact",
-    "find_friction": "find friction",
-    "find_points": "find points of colliders",
-    "weigh_points": "find impulses of colliders",
-    "push_points": "let colliders push",
-    "meet": "meet rigid bodies",
-    "move_bodies": "move rigid bodies",
-    "add_loads": "add up loads",
-    "advance": "gather {}",
-}
-
 
 @dataclass(frozen=True)
 class LawPlan:
@@ -144,14 +124,8 @@ def _fields_by_node(grid: Grid) -> list[DryField]:
 
 def _passes_of(device: Device) -> tuple[str, ...]:
     """Return the loops of one step in words."""
-    words = WORDS | {"update": "update grid" + " with colliders" * device.nodes.collides}
-    groups = device.groups
-    return tuple(
-        words[phase.name].format(groups[phase.group].law.name)
-        + " with forces" * (phase.name == "scatter" and groups[phase.group].has_body_force)
-        for phase in device.phases
-        if phase.name in words
-    )
+    laws = [group.law.name for group in device.groups]
+    return tuple(phase.words.format(laws[phase.group]) for phase in device.phases if phase.words)
 
 
 def host_bytes_of(scene: Scene, members: Sequence[Law], particles: int, real: int, *, on_cpu: bool) -> int:

@@ -358,7 +358,7 @@ class Run:
             loads = self._recorder.loads(1)
         else:
             for feature in self.batch.device.features:
-                feature.name(feature.read(self.slot)[np.newaxis], self.slot, loads)
+                feature.tell(feature.read(self.slot)[np.newaxis], self.slot, loads)
             gpu = self.batch.gpu
             gpu.begin_frame(self.batch.numbers, self.batch.counts)
             for g, group in enumerate(self.groups):

@@ -83,7 +83,7 @@ class StepSize:
     @classmethod
     def of(cls, device: Device, layout: Layout, values: DriveValues | HostValues) -> "StepSize":
         """Return the `StepSize` of the runs of a batch; `values` provides time-dependent numbers."""
-        drifts = device.particles.has_contact or not all(group.total for group in device.groups)
+        drifts = device.particles.repels or not all(group.total for group in device.groups)
         shift = farthest_shift(device.grid.fine)
         return cls(layout, device.groups, values, device.grid.scheme, drifts=drifts, shift=shift)
 

@@ -95,7 +95,7 @@ class FrameRecorder:
         rest = self._batch.frame_stats[self._slot, :count, first:].copy()
         for feature in self._batch.device.features:
             own, rest = np.split(rest, [feature.noted], axis=1)
-            feature.name(own, self._slot, found)
+            feature.tell(own, self._slot, found)
         return found
 
     def _sums(self, count: int) -> tuple[list[Sums], bool]:

@@ -62,6 +62,9 @@ class Period(Feature):
             cells = np.array([scene.domain.cells])
             self._rows.write(run, cells * scene.domain.spacing, cells)
 
+    def viewed(self, view: object) -> "Period":
+        return self.seen_from(view.w)
+
     def seen_from(self, run: object) -> "Period":
         view = copy(self)
         view.run = run

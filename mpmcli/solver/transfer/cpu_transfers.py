@@ -58,11 +58,11 @@ def scatter_range(
     rows, ratios = zero_lanes(ti.static(group.table.n)), ti.Vector.zero(float, LANES)
     shares, missing = ti.Vector.zero(float, LANES), ti.Vector.zero(float, LANES)
     pushes = zero_lanes(ti.static(d + d * d if group.is_pushed else 1))
-    touches = zero_lanes(ti.static(d if particles.has_contact else 1))
+    touches = zero_lanes(ti.static(d if particles.repels else 1))
     frictions = zero_lanes(ti.static(d if group.has_wall_friction else 1))
     loaded = ti.static(
         group.uses_f_bar
-        or particles.has_contact
+        or particles.repels
         or group.has_wall_friction
         or group.is_pushed
         or grid.scheme.keeps_flip_velocity

@@ -4,7 +4,6 @@ from copy import copy
 
 from mpmcli.boundaries.colliders import Colliders
 from mpmcli.boundaries.mirror_images import MirrorImages
-from mpmcli.boundaries.rigid_bodies import RigidBodies
 from mpmcli.boundaries.walls import REACH
 from mpmcli.quick_taichi import ti
 from mpmcli.solver.contact.collider_points import ColliderPoints
@@ -18,9 +17,8 @@ class NodeUpdate:
     Attributes:
         images: mirror images beyond walls, which constrain the velocity.
         colliders: colliders, which constrain it after the walls; None if there are none.
-        rigid: freely moving rigid bodies; None if there are none.
         points: contact at points of the surfaces of colliders, in layer 0; None if there is none.
-        couples, touches: whether `rigid` and `points` are not None; Taichi cannot compare with None.
+        collides, touches: whether `colliders` and `points` are not None; Taichi cannot compare with None.
     """
 
     def __init__(
@@ -28,13 +26,11 @@ class NodeUpdate:
         grid: Grid,
         images: MirrorImages,
         colliders: Colliders | None = None,
-        rigid: RigidBodies | None = None,
         points: ColliderPoints | None = None,
     ) -> None:
         self.grid, self.dimension, self.images = grid, grid.dimension, images
         self.needs_contact, self.needs_friction = images.needs_contact, images.needs_friction
         self.collides, self.colliders = colliders is not None, colliders
-        self.rigid, self.couples = rigid, rigid is not None
         self.touches, self.points = points is not None, points
 
     def in_layer(self, grid: Grid, layer: object) -> "NodeUpdate":

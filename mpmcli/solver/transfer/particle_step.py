@@ -114,8 +114,8 @@ def loads_on(particles: ti.template(), g: ti.template(), group: ti.template(), p
         push, slope = group.force.acceleration(group, p, kick, group.force.spreads)
     if ti.static(len(group.emitters) > 0):
         push, slope = group.mouths.steer(group.emitters, group, p, kick, push, slope)
-    if ti.static(particles.has_contact):
-        touch = particles.contact.push(group, p, particles.grid.spacing, particles.run)
+    if ti.static(particles.repels):
+        touch = particles.repulsion.push(group, p, particles.grid.spacing, particles.run)
     if ti.static(group.has_wall_friction):
         friction = friction_of_walls(particles, group, p, kick, counts)
     return share, missing, push, slope, touch, friction
@@ -152,7 +152,7 @@ def hand_over(particles: ti.template(), group: ti.template(), own: ti.template()
         v += kick * own.loads.push
         C += kick * own.loads.slope
     if ti.static(group.total):
-        if ti.static(particles.has_contact):
+        if ti.static(particles.repels):
             v += kick * own.loads.touch
         if ti.static(group.has_wall_friction):
             v += kick * own.loads.friction

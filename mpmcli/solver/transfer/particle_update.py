@@ -66,8 +66,8 @@ class ParticleUpdate:
         extent: size of the domain per axis, m.
         last: node of the upper wall per axis.
         faces: conditions of the walls per axis.
-        contact: contact between elastic bodies that are `total`, None without contact.
-        has_contact: whether `contact` is not None.
+        repulsion: contact between elastic bodies that are `total`, None without contact.
+        repels: whether `repulsion` is not None.
         friction, moving: coefficients of friction and velocities of the walls.
         run: number of the run of a view.
         watches_box: whether a particle whose stencil has left the nodes in use is lost; true on a GPU, where speeds are
@@ -81,13 +81,13 @@ class ParticleUpdate:
         grid: Grid,
         faces: Sequence[tuple[str, str]],
         group_count: int,
-        contact: ParticleContact | None,
+        repulsion: ParticleContact | None,
         friction: RoughFaces,
         moving: MovingFaces,
         *,
         watches_box: bool,
     ) -> None:
-        self.contact, self.has_contact, self.friction, self.moving = contact, contact is not None, friction, moving
+        self.repulsion, self.repels, self.friction, self.moving = repulsion, repulsion is not None, friction, moving
         self.grid = self.near = grid
         self.dimension, self.run, self.first_lost = grid.dimension, 0, 0
         self.faces = tuple(tuple(pair) for pair in faces)

@@ -1,0 +1,159 @@
+"""The phases of bodies with their own velocity fields, see `body_contact`: a part on the CPU, an item on a GPU."""
+
+from collections.abc import Sequence
+
+from mpmcli.boundaries.feature import Phase
+from mpmcli.quick_taichi import ti
+from mpmcli.solver.contact.surfaces import Obstacles
+from mpmcli.solver.particles.arrays import ParticleArrays
+
+PUSH = "let bodies push each other"
+
+
+def contact_phases(groups: Sequence[ParticleArrays], *, serial: bool) -> tuple[Phase, ...]:
+    """Return the phases between the relaxation of volumes and the walls; for `serial` see `Feature.phases`."""
+    shown = [g for g, group in enumerate(groups) if group.surfaced]
+    lists = (
+        (Phase("link_surfaces", "particles", "exchange", part=link_part),)
+        if serial
+        else (
+            Phase("reserve", "nodes", "exchange", item=reserve_item),
+            *(Phase("put", "particles", "exchange", g, item=put_item) for g in shown),
+            Phase("chain", "nodes", "exchange", item=chain_item),
+        )
+    )
+    return (
+        Phase("find_bodies", "nodes", "exchange", part=find_part, item=find_item, words="find bodies that meet"),
+        *(Phase("show_surface", "particles", "exchange", g, part=show_part, item=show_item) for g in shown),
+        *lists,
+        Phase("exchange", "threads", "exchange", part=exchange_part, item=exchange_item, words=PUSH),
+    )
+
+
+def obstacles_of(view: object) -> Obstacles:
+    """Return the walls and colliders of a run."""
+    return Obstacles(view.nodes.images.walls, view.nodes.colliders, view.grid.spacing)
+
+
+@ti.func
+def near_bodies(phases: ti.template(), at: ti.template()):
+    """Return, in a tuple, the view of the grid restricted to the box in which bodies may be in contact."""
+    box = ti.Matrix.zero(int, 2, phases.dimension)
+    for i, a in ti.static(ti.ndrange(2, phases.dimension)):
+        box[i, a] = phases.device.features.contact.surfaces.box[at.w * 2 + i, a]
+    return ti.static((at.grid.within(box),))
+
+
+@ti.func
+def rows_near_bodies(phases: ti.template(), grid: ti.template(), at: ti.template()):
+    """Return the first row of a part of the nodes where bodies may be in contact, and the one after the last."""
+    first, after = phases.places.even_part(grid.row_count(), at.region)
+    return phases.share(first, after, at.part)
+
+
+@ti.func
+def clear_part(phases: ti.template(), at: ti.template()):
+    """Clear the bins of a part of the nodes."""
+    (grid,) = ti.static(near_bodies(phases, at))
+    first, after = rows_near_bodies(phases, grid, at)
+    phases.device.features.contact.surfaces.clear_rows(grid, at.w, first, after)
+
+
+@ti.func
+def find_part(phases: ti.template(), at: ti.template()):
+    """Find the nodes where bodies are in contact."""
+    (grid,) = ti.static(near_bodies(phases, at))
+    (obstacles,) = ti.static((obstacles_of(at),))
+    first, after = rows_near_bodies(phases, grid, at)
+    phases.device.features.contact.surfaces.find_rows(grid, obstacles, at.w, first, after)
+
+
+@ti.func
+def find_item(phases: ti.template(), at: ti.template()):
+    """Find which bodies are at a node, and whether they are in contact."""
+    (grid,) = ti.static(near_bodies(phases, at))
+    (obstacles,) = ti.static((obstacles_of(at),))
+    if at.q < grid.box_nodes():
+        phases.device.features.contact.surfaces.find(grid, obstacles, at.w, grid.box_node(at.q))
+
+
+@ti.func
+def show_part(phases: ti.template(), at: ti.template()):
+    """Find the surface data of particles of the g-th group."""
+    (surfaces,) = ti.static((phases.device.features.contact.surfaces,))
+    (grid,) = ti.static(near_bodies(phases, at))
+    first, after = phases.places.even_part(surfaces.tile_count(grid, at.w), at.region)
+    first, after = phases.share(first, after, at.part)
+    for q in range(first, after):
+        surfaces.show(at.g, grid, at.w, q)
+
+
+@ti.func
+def show_item(phases: ti.template(), at: ti.template()):
+    """Find the surface data of a particle."""
+    (grid,) = ti.static(near_bodies(phases, at))
+    phases.device.features.contact.surfaces.count_particle(at.g, grid, at.w, at.q)
+
+
+@ti.func
+def link_part(phases: ti.template(), at: ti.template()):
+    """Insert the surface data of particles into the bins of their nodes, in order, on one thread."""
+    if at.region == 0 and at.part == 0:
+        (surfaces,) = ti.static((phases.device.features.contact.surfaces,))
+        (grid,) = ti.static(near_bodies(phases, at))
+        for q in range(surfaces.tile_count(grid, at.w)):
+            for g in ti.static(surfaces.surfaced):
+                surfaces.link(g, grid, at.w, q)
+
+
+@ti.func
+def reserve_item(phases: ti.template(), at: ti.template()):
+    """Reserve space for the surface data at a node."""
+    at_bins(phases, at, phases.device.features.contact.surfaces.reserve)
+
+
+@ti.func
+def put_item(phases: ti.template(), at: ti.template()):
+    """Store a particle in its reserved space."""
+    (grid,) = ti.static(near_bodies(phases, at))
+    phases.device.features.contact.surfaces.put(at.g, grid, at.w, at.q)
+
+
+@ti.func
+def chain_item(phases: ti.template(), at: ti.template()):
+    """Make lists of the surface data at a node."""
+    at_bins(phases, at, phases.device.features.contact.surfaces.chain)
+
+
+@ti.func
+def at_bins(phases: ti.template(), at: ti.template(), do: ti.template()):
+    """Call `do` for the bins of a node where bodies may be in contact."""
+    (grid,) = ti.static(near_bodies(phases, at))
+    if at.q < grid.box_nodes():
+        (surfaces,) = ti.static((phases.device.features.contact.surfaces,))
+        place = surfaces.place_of(grid, at.w, grid.linear_index(grid.box_node(at.q)))
+        ti.static(do)(at.w, place)
+
+
+@ti.func
+def exchange_part(phases: ti.template(), at: ti.template()):
+    """Exchange momentum between bodies in contact at nodes, and with walls and colliders."""
+    (grid,) = ti.static(near_bodies(phases, at))
+    (obstacles,) = ti.static((obstacles_of(at),))
+    gravity_step = phases.gravity_of(at.step)
+    first, after = rows_near_bodies(phases, grid, at)
+    thread = at.w * ti.static(phases.regions) + at.t
+    phases.device.features.contact.exchange_rows(grid, obstacles, at.w, thread, first, after, at.step.dt, gravity_step)
+
+
+@ti.func
+def exchange_item(phases: ti.template(), at: ti.template()):
+    """Exchange momentum between bodies at some nodes, and with walls and colliders."""
+    (grid,) = ti.static(near_bodies(phases, at))
+    obstacles, contact = ti.static((obstacles_of(at), phases.device.features.contact))
+    gravity_step, q = phases.gravity_of(at.step), at.q
+    while q < grid.box_nodes():
+        node = grid.box_node(q)
+        index, thread = grid.linear_index(node), at.w * contact.threads + at.q
+        contact.exchange_all(grid, obstacles, at.w, thread, node, index, at.step.dt, gravity_step)
+        q += contact.threads
