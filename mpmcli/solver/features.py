@@ -1,4 +1,4 @@
-"""The features that the runs of a batch have: the one list of them, in the order in which they act in each phase."""
+"""The features that the runs of a batch have: their one list, in the order in which the engine asks them."""
 
 from collections.abc import Iterator, Sequence
 from copy import copy
@@ -64,9 +64,8 @@ class Features:
             self.contact = BodyContact(groups, orders, grid, kind.layers, runs, backend.threads, on_cpu=on_cpu)
         if kind.by_points:
             self.colliders.support = grid.scheme.spline.nodes / 2
-            self.points = ColliderPoints(self.colliders, grid.node_count, grid.layers, runs)
-            self.points.couples = self.rigid is not None
-            self.points.fills = any(law.relaxes for law in kind.members)
+            fills = any(law.relaxes for law in kind.members)
+            self.points = ColliderPoints(self.colliders, grid.node_count, grid.layers, runs, fills=fills)
         self.repulsion = ParticleContact(grid, groups[0], runs) if total and max(kind.bodies) > 1 else None
         self.emission = Emission(kind.inflow, d, runs) if kind.inflow.groups else None
         for g, group in enumerate(groups if self.emission else ()):

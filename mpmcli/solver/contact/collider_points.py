@@ -74,7 +74,7 @@ class ColliderPoints(Feature):
         given: velocity of the material times `share`, then the impulse per weight on the material, N s.
     """
 
-    def __init__(self, colliders: Colliders, nodes: int, layers: int, runs: int) -> None:
+    def __init__(self, colliders: Colliders, nodes: int, layers: int, runs: int, *, fills: bool) -> None:
         """Allocate points for a grid with a number of nodes per run and layer."""
         d = colliders.dimension
         self.colliders, self.dimension, self.run, self.layers = colliders, d, 0, layers
@@ -91,7 +91,7 @@ class ColliderPoints(Feature):
         self.rows = math.prod(colliders.shape[:-1])
         self.busy, self.marked = ti.field(int, shape=runs * self.rows), ti.field(int, shape=runs * self.rows)
         self.spline = QuadraticSpline()
-        self.couples = self.fills = False
+        self.couples, self.fills = len(colliders.kind.free) > 0, fills
 
     @staticmethod
     def room(nodes: int, dimension: int) -> int:
@@ -100,17 +100,16 @@ class ColliderPoints(Feature):
 
     def on(self, nodes: int) -> "ColliderPoints":
         """Return points for a grid with another number of nodes, and the same numbers of runs."""
-        result = ColliderPoints(self.colliders, nodes, self.layers, self.density.shape[0])
-        result.density, result.rate, result.couples, result.fills = self.density, self.rate, self.couples, self.fills
+        result = ColliderPoints(self.colliders, nodes, self.layers, self.density.shape[0], fills=self.fills)
+        result.density, result.rate = self.density, self.rate
         return result
 
     def viewed(self, view: object) -> "ColliderPoints":
         return changed(self, run=view.w, colliders=view.features.colliders)
 
     def phases(self, **_how: bool) -> tuple[Phase, ...]:
-        fills = [Phase("fill_solids", "nodes", "scatter", body=fill_solids, wanted=near_row)]
         found = [
-            *fills * self.fills,
+            *[Phase("fill_solids", "nodes", "scatter", body=fill_solids, wanted=near_row)] * self.fills,
             Phase("find_points", "nodes", "points", body=find_points, wanted=new_row, words="find points of colliders"),
             Phase("spread_points", "nodes", "points", body=spread_points, wanted=marked_row),
             Phase(
