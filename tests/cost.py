@@ -110,11 +110,13 @@ def _beyond() -> dict[str, int]:
     return {file: len(kinds) for file, kinds in sorted(_kinds.items()) if len(kinds) > KINDS.get(file, 0)}
 
 
+@pytest.hookimpl(trylast=True)
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     for file, n in _beyond().items():
         terminalreporter.write_line(
             f"{file} runs {n} kinds of kernels, and {KINDS.get(file, 0)} in tests/kinds.toml: share a kind, or mark "
-            "tests as slow."
+            "tests as slow.",
+            red=True,
         )
 
 
