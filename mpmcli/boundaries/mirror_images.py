@@ -10,6 +10,7 @@ from copy import copy
 
 from mpmcli.boundaries.walls import AWAY, REACH, Walls
 from mpmcli.quick_taichi import ti
+from mpmcli.scene.domain import SEPARATING
 
 # A separating wall acts where the node on it is filled to the fraction REACHED of that inside. Half of its kernel is
 # outside, so that the filled fraction is twice its mass. Material that comes near is then a fifth of a cell away. The
@@ -46,7 +47,8 @@ class MirrorImages:
         self.apart = on_cpu and walls.dimension == 3
         self.planes = tuple(a for a, _ in walls.separating) + tuple(a for _, _, a, _ in walls.rough)
         self.crossed = tuple(
-            any(word != "separate" for b in walls.lateral[a] for word in walls.faces[b]) for a in range(self.dimension)
+            any(word not in SEPARATING for b in walls.lateral[a] for word in walls.faces[b])
+            for a in range(self.dimension)
         )
 
     def along(self, axes: Sequence[int]) -> "MirrorImages":
@@ -293,7 +295,7 @@ class MirrorImages:
                     depth, mirror, upper_side = self.walls.place(node)
                     acts = ti.Vector.zero(int, self.dimension)
                     for b in ti.static(self.walls.lateral[axis]):
-                        separates = self.walls.face_is("separate", b, upper_side[b])
+                        separates = self.walls.face_in(SEPARATING, b, upper_side[b])
                         acts[b] = ti.cast(depth[b] <= REACH and not separates, int)
                     holds = self.walls.holding(node, depth, upper_side, False)
                     value = self.image_sum(grid, 0, node, mirror, acts, depth, holds, upper_side, gravity_step)

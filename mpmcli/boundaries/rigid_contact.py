@@ -15,6 +15,7 @@ from mpmcli.boundaries.rigid_bodies import RigidBodies
 from mpmcli.boundaries.rows import Rows
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
+from mpmcli.scene.domain import OPEN, STICKING
 from mpmcli.scene.primitives import Ball
 
 # Distance in cells below which a point may touch an obstacle in a step; fraction of a penetration that a step removes;
@@ -70,7 +71,7 @@ class RigidContact(Feature):
     def __init__(self, bodies: RigidBodies, faces: tuple[tuple[str, str], ...], runs: int) -> None:
         d, self.bodies, self.dimension = bodies.dimension, bodies, bodies.dimension
         self.capacity = bodies.colliders.kind.points
-        self.walls = tuple((a, side) for a in range(d) for side in (0, 1) if faces[a][side] != "open")
+        self.walls = tuple((a, side) for a in range(d) for side in (0, 1) if faces[a][side] != OPEN)
         n = runs * self.capacity
         self.used = ti.field(int, shape=runs)
         # Of each body the radius if it is a ball, m, else 0.
@@ -110,7 +111,7 @@ class RigidContact(Feature):
         words, frictions = scene.domain.walls.faces(self.dimension), scene.domain.frictions
         faces = np.zeros((self.dimension, 2))
         for a, side in self.walls:
-            faces[a, side] = STUCK if words[a][side] == "stick" else frictions[a][side]
+            faces[a, side] = STUCK if words[a][side] in STICKING else frictions[a][side]
         self._runs.write(run, [len(points)], [faces])
 
     def saved(self) -> dict[str, ti.Field]:

@@ -12,15 +12,13 @@ from mpmcli.boundaries.feature import Feature, changed
 from mpmcli.boundaries.rows import Rows
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
-from mpmcli.scene.domain import PERIODIC
+from mpmcli.scene.domain import OPEN, PERIODIC, SEPARATING, STICKING
 from mpmcli.scene.schema import SolverSettings
 
 # Nodes on each side of a wall that can hold mass from particles of the other side.
 REACH = 2
 # Nodes beyond a periodic face to which particles scatter before they are moved back into the domain: all of the grid.
 PERIODIC_REACH = 3
-# Condition of a face that is not a wall.
-OPEN = "open"
 # Entry of `Walls.contact` where the material has yet to reach the wall (docs/theory.md, 3.2).
 AWAY = -1
 
@@ -110,7 +108,7 @@ SMOOTH = RoughFaces(())
 def faces_on_grid(faces: Sequence[tuple[str, str]], settings: SolverSettings) -> tuple[tuple[str, str], ...]:
     """Return the conditions of the walls that mirror nodes: with total Lagrangian solids, separating walls do not."""
     total = settings.solids == "total"
-    return tuple(tuple(OPEN if total and word == "separate" else word for word in pair) for pair in faces)
+    return tuple(tuple(OPEN if total and word in SEPARATING else word for word in pair) for pair in faces)
 
 
 @ti.data_oriented
@@ -125,7 +123,7 @@ class Walls:
         first: index of the node plane of the lower faces; `last`, per axis, of the upper faces.
         shape: nodes of the grid per axis.
         lateral: per axis, the other axes.
-        separating: (axis, side) of every face with the condition "separate".
+        separating: (axis, side) of every face that material may leave.
         axes: axes whose faces are considered: all, or fewer for nodes that are near no other faces, see `along`.
         contact: (planes, nodes) int, per separating face and node of its plane, whether the material presses on it: 1,
             0, or AWAY.
@@ -163,7 +161,7 @@ class Walls:
         self.first, self.shut = first, 0
         self.last = tuple(first + n for n in cells)
         self.separating = tuple(
-            (a, side) for a in range(self.dimension) for side in (0, 1) if self.faces[a][side] == "separate"
+            (a, side) for a in range(self.dimension) for side in (0, 1) if self.faces[a][side] in SEPARATING
         )
         self.lateral = tuple(tuple(b for b in range(self.dimension) if b != a) for a in range(self.dimension))
         self.shape = tuple(shape)
@@ -299,13 +297,13 @@ class Walls:
         return index
 
     @ti.func
-    def face_is(self, word: ti.template(), axis: ti.template(), upper: int):
-        """Return whether the face of `axis` on that side has this condition."""
+    def face_in(self, words: ti.template(), axis: ti.template(), upper: int):
+        """Return whether the condition of the face of `axis` on that side is one of some words."""
         # Branches, because inside some conditions Taichi takes a static flag as an operand of `and` for false.
         result = False
-        if ti.static(self.faces[axis][0] == word):
+        if ti.static(self.faces[axis][0] in words):
             result = upper == 0
-        if ti.static(self.faces[axis][1] == word):
+        if ti.static(self.faces[axis][1] in words):
             if upper == 1:
                 result = True
         return result
@@ -318,7 +316,7 @@ class Walls:
         """
         holds = ti.Vector.zero(int, self.dimension)
         for a in ti.static(self.axes):
-            holds[a] = ti.cast(self.face_is("stick", a, upper[a]), int)
+            holds[a] = ti.cast(self.face_in(STICKING, a, upper[a]), int)
         if ti.static(rubbed):
             for r, _number, axis, side in ti.static(self.rough):
                 if ti.static(axis in self.axes):

@@ -7,6 +7,7 @@ from itertools import product
 import numpy as np
 
 from mpmcli.scene import Scene
+from mpmcli.scene.domain import STICKING
 from mpmcli.scene.primitives import TurnedBox, edge_distances
 from mpmcli.scene.shapes import Ball, Box, Capsule, Composite, Cylinder, Form, Mesh, Points, Polygon, distance_grid
 
@@ -24,10 +25,10 @@ TRIED, HALVINGS, KEPT = 16, 7, 500
 
 
 def spanned_axes(scene: Scene, form: Form) -> set[int]:
-    """Return the axes along which a box spans the domain between walls without "stick", like unbounded matter."""
+    """Return the axes along which a box spans the domain between walls that do not stick, like unbounded matter."""
     if not isinstance(form, Box):
         return set()
-    return {a for a, faces in enumerate(touched_walls(scene, form)) if all(faces) and "stick" not in faces}
+    return {a for a, faces in enumerate(touched_walls(scene, form)) if all(faces) and STICKING.isdisjoint(faces)}
 
 
 def touched_walls(scene: Scene, form: Box) -> list[tuple[str, str]]:

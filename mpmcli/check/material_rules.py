@@ -10,6 +10,7 @@ from mpmcli.check.finding import Finding
 from mpmcli.check.geometry import touched_walls
 from mpmcli.plain_text import plain_number
 from mpmcli.scene.bounds import body_points
+from mpmcli.scene.domain import PASSED, STICKING
 from mpmcli.scene.primitives import Box
 from mpmcli.scene.quantity import AXES
 
@@ -120,7 +121,7 @@ def _density(facts: SceneFacts) -> Iterator[Finding]:
 def _slippery(facts: SceneFacts) -> Iterator[Finding]:
     """Yield materials that slide on a frictionless floor although they would adhere to it."""
     (axis, side), domain = _floor(facts), facts.scene.domain
-    if side is None or domain.walls.faces(facts.scene.dimension)[axis][side] not in ("slip", "separate"):
+    if side is None or domain.walls.faces(facts.scene.dimension)[axis][side] in PASSED | STICKING:
         return
     gripping = [body.name for body in facts.bodies if _grips(body) and not _contained(facts, body)]
     if gripping and domain.frictions[axis][side] == 0:

@@ -17,7 +17,7 @@ from mpmcli.check.result_state import STRETCHED, TORN
 from mpmcli.scene import Scene
 from mpmcli.scene.bounds import body_points
 from mpmcli.scene.colliders import Motion, Plane
-from mpmcli.scene.domain import PERIODIC
+from mpmcli.scene.domain import OPEN, PASSED, SEPARATING
 from mpmcli.scene.primitives import grid_points
 from mpmcli.scene.problem import quoted, several
 from mpmcli.scene.quantity import AXES
@@ -114,7 +114,7 @@ def _sticking(facts: SceneFacts) -> Iterator[Finding]:
         return
     domain, d = scene.domain, scene.dimension
     faces = zip(domain.walls.faces(d), domain.frictions, strict=True)
-    rough = any(word == "separate" and mu > 0 for words, own in faces for word, mu in zip(words, own, strict=True))
+    rough = any(word in SEPARATING and mu > 0 for words, own in faces for word, mu in zip(words, own, strict=True))
     rough = rough or any(one.wall == "separate" and one.friction > 0 for one in scene.colliders)
     if rough and not scene.one_field:
         what = f'Body "{elastic[0]}" is alone, so that it does not meet walls and colliders at its surface, nor rolls.'
@@ -141,7 +141,7 @@ def _walls(facts: SceneFacts) -> Iterator[Finding]:
         for a, axis in enumerate(AXES[: facts.scene.dimension]):
             gaps = {f"{axis}_min": lower[a] - domain.origin[a], f"{axis}_max": domain.upper[a] - upper[a]}
             for (face, gap), word in zip(gaps.items(), words[a], strict=True):
-                meets = word == "separate" and facts.scene.separates(body.body)
+                meets = word in SEPARATING and facts.scene.separates(body.body)
                 if not meets and not domain.periodic[a] and 1e-3 < gap / h < WALL_REACH * (1 - 1e-6):
                     begins = f'Body "{body.name}" begins {gap / h:.2g} cells from the wall {face}'
                     what = f"{begins}, which already acts on it."
@@ -310,7 +310,7 @@ def _rigid(facts: SceneFacts) -> Iterator[Finding]:
     scene, h = facts.scene, facts.scene.domain.spacing
     # A single elastic body has material on one side only.
     between = scene.emitters or len(facts.bodies) > 1 or any(not one.body.has_surface for one in facts.bodies)
-    shut = np.array(scene.domain.walls.faces(scene.dimension)) != "open"
+    shut = np.array(scene.domain.walls.faces(scene.dimension)) != OPEN
     for body in (collider for collider in scene.colliders if collider.free):
         lower, upper = np.array(body.form.bounds())
         cells = float((upper - lower).min() / h)
@@ -378,7 +378,7 @@ def _room(facts: SceneFacts) -> Iterator[Finding]:
     scene = facts.scene
     words = {word for pair in scene.domain.walls.faces(scene.dimension) for word in pair}
     moving = [collider for collider in scene.colliders if collider.driven and not collider.holds]
-    if not moving or scene.emitters or {PERIODIC, "open"} & words:
+    if not moving or scene.emitters or PASSED & words:
         return
     found = min(_rooms(scene), default=(math.inf, 0.0, 0.0, ""))
     ratio, time, volume, names = found

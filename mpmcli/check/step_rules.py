@@ -13,6 +13,7 @@ from mpmcli.check.material_rules import LOCKING
 from mpmcli.check.shape_rules import pulled_stretch
 from mpmcli.plain_text import plain_number
 from mpmcli.scene.bounds import body_points, highest_speed
+from mpmcli.scene.domain import STICKING
 from mpmcli.scene.schema import USUAL_FLIP, SolverSettings
 from mpmcli.scene.shapes import Ball, Box, Form, Points
 from mpmcli.stability.transfer_factors import impact_loss, loss_per_step, step_inertia
@@ -230,13 +231,13 @@ def _percent(share: float) -> str:
 
 
 def flow_width(facts: SceneFacts, body: BodyFacts) -> float:
-    """Return half the longest wave of a flow along walls, m: the width of a box, twice that with one "stick" side."""
+    """Return half the longest wave of a flow along walls, m: the width of a box, twice that if one side sticks."""
     scene, form = facts.scene, body.body.shape.form
     if not isinstance(form, Box):
         return body.thickness
     endless = spanned_axes(scene, form)
     widths = [
-        (form.max[a] - form.min[a]) * (2 if faces.count("stick") == 1 else 1)
+        (form.max[a] - form.min[a]) * (2 if sum(word in STICKING for word in faces) == 1 else 1)
         for a, faces in enumerate(touched_walls(scene, form))
         if a not in endless
     ]

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from mpmcli.scene import Scene, scene_to_toml
-from mpmcli.scene.domain import FEWEST_CELLS, FEWEST_PERIODIC_CELLS, PERIODIC
+from mpmcli.scene.domain import FEWEST_CELLS, FEWEST_PERIODIC_CELLS, PASSED, PERIODIC
 from mpmcli.scene.quantity import AXES
 
 Tables = dict[str, Any]
@@ -120,7 +120,7 @@ def fixed_faces(tables: Tables, reach: Reach) -> list[tuple[bool, bool]]:
     domain, found = tables["domain"], []
     for k, (origin, size) in enumerate(zip(domain["origin"], domain["size"], strict=True)):
         near = [gap < NEAR * domain["spacing"] for gap in (reach.low[k] - origin, origin + size - reach.high[k])]
-        passed = [wall(tables, k, side) in ("open", PERIODIC) for side in ("min", "max")]
+        passed = [wall(tables, k, side) in PASSED for side in ("min", "max")]
         found.append((near[0] or passed[0], near[1] or passed[1]))
     return found
 

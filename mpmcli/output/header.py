@@ -12,7 +12,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
 from mpmcli import __version__
 from mpmcli.scene import Scene
 from mpmcli.scene.colliders import Collider, ColliderShape
-from mpmcli.scene.domain import PERIODIC, Walls
+from mpmcli.scene.domain import OPEN, PERIODIC, STICKING, Walls
 from mpmcli.scene.entry import definitions
 from mpmcli.scene.mesh import ClosedSurface, Mesh
 from mpmcli.scene.quantity import AXES
@@ -253,12 +253,12 @@ class RunHeader:
         periodic = np.array([PERIODIC in pair for pair in faces] or [False] * d, bool)
         runs_on = steady is not None and bool(steady[periodic].any())
         total = solver.solids == "total"
-        opens = tuple("open" in pair for pair in faces)
+        opens = tuple(OPEN in pair for pair in faces)
         comes_and_goes = bool(scene.emitters) or any(opens)
         moved = bool(domain.wall_velocity or scene.forces or scene.impulses)
         friction = domain.friction if isinstance(domain.friction, dict) else {"default": domain.friction}
         rough = [any(friction.get(name, 0) > 0 for name in ("default", f"{a}_min", f"{a}_max")) for a in AXES]
-        sticking = tuple("stick" in pair or own for own, pair in zip(rough, faces, strict=False))
+        sticking = tuple(own or not STICKING.isdisjoint(pair) for own, pair in zip(rough, faces, strict=False))
         return cls(
             stored=dict(stored),
             title=facts.title,

@@ -14,6 +14,7 @@ from mpmcli.render.render_scene import RenderScene
 from mpmcli.render.settings import Arrow, Theme, rgb_bytes
 from mpmcli.render.view import View, corners_of
 from mpmcli.scene.colliders import Collider
+from mpmcli.scene.domain import OPEN, PERIODIC
 from mpmcli.scene.surface import collider_surface
 
 if TYPE_CHECKING:
@@ -191,10 +192,10 @@ class PictureLayout:
         left, right = (x0 - w, y0 - w, x0 - 1, y1 + w - 1), (x1, y0 - w, x1 + w - 1, y1 + w - 1)
         below, above = (x0 - w, y1, x1 + w - 1, y1 + w - 1), (x0 - w, y0 - w, x1 + w - 1, y0 - 1)
         for line, word in zip((left, right, below, above), sum(faces, ()), strict=True):
-            if word != "open":
+            if word != OPEN:
                 draw.rectangle(line, fill=self.theme.wall)
             along = int(line in (left, right))
-            for start in range(line[along] + dash, line[along + 2], 2 * dash) if word == "periodic" else ():
+            for start in range(line[along] + dash, line[along + 2], 2 * dash) if word == PERIODIC else ():
                 gap = list(line)
                 gap[along], gap[along + 2] = start, min(start + dash, line[along + 2]) - 1
                 draw.rectangle(gap, fill=self.theme.ground)

@@ -8,6 +8,7 @@ import numpy as np
 
 from mpmcli.scene.bounds import body_places
 from mpmcli.scene.colliders import Collider, Plane, has_jump, slope_of
+from mpmcli.scene.domain import SEPARATING, STICKING
 from mpmcli.scene.entry import entries_in, tree_of, value_of, varies
 from mpmcli.scene.expression import Expression
 from mpmcli.scene.mesh import Mesh, leaving, moved_inside
@@ -445,14 +446,14 @@ def _nearly_held(body: Body, index: int, scene: Scene) -> Iterator[Problem]:
     for k, pair in enumerate(domain.walls.faces(scene.dimension)):
         gaps = (lower[k] - domain.origin[k], domain.upper[k] - upper[k])
         for side, word, gap in zip(("min", "max"), pair, gaps, strict=True):
-            if word != "separate" and _TOLERANCE * h < gap < _CLEAR * h:
+            if word not in SEPARATING and _TOLERANCE * h < gap < _CLEAR * h:
                 said = (
                     f'body "{body.name}" begins {gap:.4g} m from the wall {AXES[k]}_{side}, which does not separate; '
                     f'with solver.solids = "total" it must touch it, or begin {_CLEAR * h:.4g} m away, or the wall be '
                     '"separate"'
                 )
                 yield Problem(("bodies", index, "shape"), said)
-            elif word == "stick" and gap >= _CLEAR * h:
+            elif word in STICKING and gap >= _CLEAR * h:
                 said = (
                     f'"stick" is, with solver.solids = "total", for a wall that the body touches at the start; '
                     f'"{body.name}" begins {gap:.4g} m away, and would not stick to it later: give "separate" and '

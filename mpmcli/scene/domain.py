@@ -58,7 +58,12 @@ def spacing_of(size: tuple[float, ...], cells: tuple[int, ...]) -> float:
     return spacings[0]
 
 
-PERIODIC = "periodic"
+Wall = Literal["slip", "stick", "separate", "periodic", "open"]
+WALLS: tuple[str, ...] = get_args(Wall)
+PERIODIC, OPEN = "periodic", "open"
+# What a word means is told here alone: faces that are no walls, walls along which nothing moves, and walls that
+# material may leave.
+PASSED, STICKING, SEPARATING = frozenset({PERIODIC, OPEN}), frozenset({"stick"}), frozenset({"separate"})
 # Sorting moves particles back into the domain. Before it they reach up to three nodes beyond a face, and no node may
 # have two images.
 FEWEST_PERIODIC_CELLS = 7
@@ -102,7 +107,7 @@ def require_grip(velocity: WallVelocity, words: Mapping[str, str], frictions: Ma
             )
         if words[face] == PERIODIC:
             raise flaw(f'is for a wall, and domain.walls has "periodic" for {face}; leave it out', key)
-        if words[face] != "stick" and frictions[face] == 0:
+        if words[face] not in STICKING and frictions[face] == 0:
             raise flaw(
                 f'acts on nothing: domain.walls has "{words[face]}" for {face}, without friction; give "stick", or '
                 f"domain.friction",
@@ -110,12 +115,8 @@ def require_grip(velocity: WallVelocity, words: Mapping[str, str], frictions: Ma
             )
 
 
-Wall = Literal["slip", "stick", "separate", "periodic", "open"]
-WALLS: tuple[str, ...] = get_args(Wall)
 # Each wall acts on nodes up to two cells away from it, and no node may belong to both walls of an axis.
 FEWEST_CELLS = 5
-# Faces without friction: material does not slip along them, or they are no walls.
-_NEVER_SLIP = ("stick", PERIODIC, "open")
 
 
 class Walls(Faces):
@@ -143,7 +144,7 @@ class Walls(Faces):
 
     def any_open(self, dimension: int) -> bool:
         """Return whether material can leave through a face."""
-        return any("open" in pair for pair in self.faces(dimension))
+        return any(OPEN in pair for pair in self.faces(dimension))
 
 
 class Friction(Faces):
@@ -255,13 +256,13 @@ class Domain(Table):
     def _faces_that_belong_together(self) -> "Domain":
         words = self._words()
         for face, word in words.items():
-            if word in _NEVER_SLIP and getattr(self.friction, face) is not None:
+            if word in PASSED | STICKING and getattr(self.friction, face) is not None:
                 raise flaw(
                     f'is for a wall that can slip, and domain.walls has "{word}" for {face}; leave it out, or give '
                     f'"slip" or "separate" there',
                     f"friction.{face}",
                 )
-        if self.friction.default > 0 and set(words.values()) <= {*_NEVER_SLIP}:
+        if self.friction.default > 0 and set(words.values()) <= PASSED | STICKING:
             found = " or ".join(f'"{word}"' for word in sorted({*words.values()}, reverse=True))
             raise flaw(f"is for walls that can slip, and domain.walls has {found} for all; leave it out", "friction")
         for axis, count in zip(AXES, self.cells, strict=False):
@@ -297,7 +298,7 @@ class Domain(Table):
         found = []
         for face, word in self._words().items():
             own = getattr(self.friction, face)
-            found.append(0.0 if word in _NEVER_SLIP else self.friction.default if own is None else own)
+            found.append(0.0 if word in PASSED | STICKING else self.friction.default if own is None else own)
         return tuple(zip(found[::2], found[1::2], strict=True))
 
     @property

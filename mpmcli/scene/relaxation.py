@@ -6,7 +6,7 @@ from itertools import product
 
 import numpy as np
 
-from mpmcli.scene.domain import PERIODIC, Domain
+from mpmcli.scene.domain import PASSED, PERIODIC, Domain
 from mpmcli.scene.shapes import Form
 
 # Descent steps in 2D and 3D, the fraction of a Newton step in each, and the fraction of the previous step that is added
@@ -96,7 +96,7 @@ class _Nodes:
         faces = domain.walls.faces(len(self.cells))
         spans = (lower < _SLACK) & (upper > self.cells - _SLACK)
         self.periodic = spans & np.array([PERIODIC in pair for pair in faces])
-        self.walls = np.array([[word not in (PERIODIC, "open") for word in pair] for pair in faces])
+        self.walls = np.array([[word not in PASSED for word in pair] for pair in faces])
         ends = np.array([np.full(len(spans), _SLACK), self.cells - _SLACK])
         self.reach = np.where(self.walls.T, ends, [[-np.inf], [np.inf]])
         self.folds = list(self._folds())

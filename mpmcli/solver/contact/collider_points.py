@@ -19,6 +19,7 @@ from mpmcli.materials.law import StateBound
 from mpmcli.materials.registry import laws
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
+from mpmcli.scene.domain import STICKING
 from mpmcli.solver.transfer.splines import QuadraticSpline
 
 # A point acts if the share of its kernel that is filled is FULL or more, not at all up to EMPTY. The share falls from 1
@@ -198,7 +199,7 @@ class ColliderPoints(Feature):
             for c in ti.static(range(self.dimension)):
                 if ti.static(c == a):
                     sign[c] = -sign[c]
-                elif walls.face_is("stick", a, upper[a]):
+                elif walls.face_in(STICKING, a, upper[a]):
                     sign[c] = -sign[c]
 
     @ti.func
@@ -577,7 +578,7 @@ class ColliderPoints(Feature):
         way = change
         for a in ti.static(range(d)):
             if acts[a] == 1 and depth[a] == 0:
-                holds = walls.face_is("stick", a, upper[a])
+                holds = walls.face_in(STICKING, a, upper[a])
                 for c in ti.static(range(d)):
                     if ti.static(c == a):
                         way[c] = 0.0

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from mpmcli.boundaries.feature import Feature
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import SolverSettings
+from mpmcli.scene.domain import SEPARATING
 from mpmcli.solver.grid.grid import Grid
 from mpmcli.solver.particles.arrays import MASS, VOLUME, ParticleArrays
 
@@ -84,7 +85,7 @@ def overlap_of(
     # A body that initially touches the wall starts without a push, whatever its spacing along this axis.
     overlap = ti.min(0.5 * spacing, at_rest) * stretched - distance
     meets = overlap > 0.0
-    if ti.static(particles.faces[a][side] != "separate"):
+    if ti.static(particles.faces[a][side] not in SEPARATING):
         meets = meets and at_rest >= HELD * particles.grid.spacing
     return overlap, meets
 

@@ -16,6 +16,7 @@ from mpmcli.boundaries.rows import Rows
 from mpmcli.frames.frame import ACTIVE, BLOCKED, WAITING
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
+from mpmcli.scene.domain import OPEN
 from mpmcli.scene.entry import varies
 from mpmcli.scene.sheets import Sheets, fastest_inflow, sheets_of
 from mpmcli.solver.particles.sort import entry_count
@@ -60,7 +61,7 @@ class Inflow:
 
 
 def open_faces(faces: Sequence[tuple[str, str]]) -> tuple[tuple[int, int], ...]:
-    return tuple((a, side) for a, pair in enumerate(faces) for side in (0, 1) if pair[side] == "open")
+    return tuple((a, side) for a, pair in enumerate(faces) for side in (0, 1) if pair[side] == OPEN)
 
 
 def first_ids(scene: Scene, counts: Sequence[int]) -> list[int]:
