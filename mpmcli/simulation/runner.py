@@ -46,8 +46,8 @@ class Recorder:
     """Collects the frames of a run in progress, or gives them to `observe`, and collects only the ledger."""
 
     def __init__(self, run: Run, scene: Scene, backend: Backend, observe: Observe | None = None) -> None:
-        facts = {"arch": backend.arch, "threads": backend.threads, "precision": backend.precision}
-        self._header = RunHeader.of(scene, scene_to_toml(scene), [laws()[name] for name in run.laws], facts)
+        names = [laws()[name] for name in run.laws]
+        self._header = RunHeader.of(scene, scene_to_toml(scene), names, backend.facts)
         self._run = run
         self._observe = observe
         self._frames: list[Frame] = []

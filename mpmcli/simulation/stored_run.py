@@ -1,146 +1,285 @@
-"""Creates and completes the files of a run: record, scene, frames and checkpoints."""
+"""One run and its files: record, scene, frames and checkpoints."""
 
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
+from mpmcli.check.finding import merged
+from mpmcli.check.result_check import check_result
 from mpmcli.check.scene_check import SceneCheck
-from mpmcli.errors import DiskFullError, RunError
-from mpmcli.output import RunRecord
+from mpmcli.errors import DiskFullError, MpmcliError, RunError
+from mpmcli.frames.ledger import LedgerRow
+from mpmcli.materials.registry import laws
+from mpmcli.output import RunRecord, open_result
 from mpmcli.output.checkpoints import Checkpoint, write_checkpoint
 from mpmcli.output.directory import SCENE, TakenDirectory
 from mpmcli.output.durable import write_text
-from mpmcli.output.layout import DAMAGED
-from mpmcli.output.series import write_series
+from mpmcli.output.header import RunHeader
+from mpmcli.output.layout import DAMAGED, sealed_segments
+from mpmcli.output.series import SERIES, write_series
 from mpmcli.output.store import HOLD, SegmentStore
-from mpmcli.scene import LoadedScene, Scene
-from mpmcli.simulation.resume import Resumption, file_digests
+from mpmcli.scene import LoadedScene, scene_to_toml
+from mpmcli.simulation.resume import Resumption, file_digests, go_on, require_same_run, take_over
 from mpmcli.simulation.settings import RunSettings, StopCondition
-from mpmcli.simulation.summary import RunSummary
+from mpmcli.simulation.summary import RunSummary, Stopwatch
 from mpmcli.solver.engine.plan import Plan
 from mpmcli.solver.engine.run import Run
-from mpmcli.solver.machine.backend import Backend
+from mpmcli.solver.frames.diagnosis import UnstableRunError
+from mpmcli.solver.machine.backend import Backend, is_out_of_memory, out_of_memory_sentence
 
 
-class RunContext(NamedTuple):
-    """The inputs of a run.
+@dataclass
+class StoredRun:
+    """A run, new or resumed, whose frames `compute` computes and stores, or `pack` only packs.
 
     Attributes:
-        began: start in the time of `time.perf_counter`, s; earlier: the resumed part. notes: automatic choices, and
-            warnings of the check. taken: the directory, locked against other processes.
+        check: of the scene. earlier: the resumed part. taken: the directory, locked against other processes.
+        began: start in the time of `time.perf_counter`, s. on_start, on_frame, stop: see `simulate`.
     """
 
     loaded: LoadedScene
     settings: RunSettings
     plan: Plan
     backend: Backend
-    earlier: Resumption | None
-    notes: tuple[str, ...]
-    began: float
-    taken: TakenDirectory
     check: SceneCheck
+    earlier: Resumption | None
+    taken: TakenDirectory
+    began: float
+    on_start: Callable[[RunSummary], None]
+    on_frame: Callable[[LedgerRow, RunSummary], None]
+    stop: Callable[[], bool | str]
 
-    @property
-    def scene(self) -> Scene:
-        """The scene."""
-        return self.loaded.scene
+    def __post_init__(self) -> None:
+        scene, earlier = self.loaded.scene, self.earlier
+        self._scene, self._directory, self._text = scene, self.settings.directory, scene_to_toml(scene)
+        # Whether time.step is used even above the stable step.
+        self._forced = self.settings.force and scene.time.step != "auto"
+        self._halt = StopCondition(self.stop, self.settings.limits, compress=scene.output.compress)
+        notes = (*self.loaded.notes, *(one.line for one in merged(self.check.findings) if one.severity != "note"))
+        counts = self.plan.particles, scene.time.frames + 1
+        self._summary = summary = RunSummary(self._directory, *counts, self.backend.facts, notes, self.plan)
+        if earlier is not None:
+            summary.notes += (earlier.note,)
+            summary.frames = earlier.frames
+            if earlier.rows:
+                summary.first, summary.last = earlier.rows[0], earlier.rows[-1]
+                summary.steps = int(earlier.index.steps[-1])
+            summary.steps_before = earlier.step
 
-    @property
-    def directory(self) -> Path:
-        """The output directory."""
-        return self.settings.directory
-
-    @property
-    def forced(self) -> bool:
-        """Whether time.step is used even above the stable step."""
-        return self.settings.force and self.scene.time.step != "auto"
-
-    @property
-    def facts(self) -> dict[str, object]:
-        """The backend, as in a header."""
-        backend = self.backend
-        return {"arch": backend.arch, "threads": backend.threads, "precision": backend.precision}
-
-
-def new_summary(context: RunContext) -> RunSummary:
-    """Return the summary of a new or resumed run."""
-    plan, earlier = context.plan, context.earlier
-    expected = context.scene.time.frames + 1
-    summary = RunSummary(context.directory, plan.particles, expected, context.facts, context.notes, plan)
-    if earlier is not None:
-        summary.notes += (earlier.note,)
-        summary.frames = earlier.frames
-        if earlier.rows:
-            summary.first, summary.last = earlier.rows[0], earlier.rows[-1]
-            summary.steps = int(earlier.index.steps[-1])
-        summary.steps_before = earlier.step
-    return summary
-
-
-def new_store(
-    context: RunContext, header: dict[str, Any], replace_earlier: Callable[[Path], None] | None = None
-) -> SegmentStore:
-    """Return the store of a run, which continues after the existing frames, or replaces those of another run."""
-    scene, earlier = context.scene, context.earlier
-    options = {"compress": scene.output.compress, "colliders": scene.colliders, "replace_earlier": replace_earlier}
-    store = SegmentStore(context.directory, header, hold=HOLD, **options)
-    if earlier is not None and earlier.index is not None:
-        store.go_on_after(earlier.index)
-    return store
-
-
-def write_scene(directory: Path, text: str) -> None:
-    """Write the effective scene to the output directory; RunError: the disk is full or a write failed."""
-    try:
-        write_text(directory / SCENE, text)
-    except OSError as error:
-        raise RunError(f"{directory / SCENE} could not be written ({error.strerror or error}).") from error
-
-
-def finish(context: RunContext, store: SegmentStore, summary: RunSummary, halt: StopCondition) -> None:
-    """Pack the stored frames, and also write them as a series if requested.
-
-    Before that, the result is the directory with its sealed frames.
-    """
-    summary.path = summary.directory
-    try:
-        summary.path = store.finish(halt.packing)
-        (context.directory / DAMAGED).unlink(missing_ok=True)
-        if context.settings.form == "vtk" and summary.path is not None:
-            colliders, compress = context.scene.colliders, context.scene.output.compress
-            summary.path = write_series(context.directory, colliders, compress=compress, stop=halt.packing)
-    except KeyboardInterrupt:
-        if not halt.status:
+    def compute(self, run: Run) -> RunSummary:
+        """Compute and store the frames that are missing, and pack all."""
+        summary, earlier, taken, halt = self._summary, self.earlier, self.taken, self._halt
+        names = [laws()[name] for name in run.laws]
+        header = RunHeader.of(self._scene, self._text, names, self.backend.facts).stored
+        if earlier is not None:
+            require_same_run(earlier, header, self._directory)
+            go_on(run, earlier, self.backend, forced=self._forced)
+            take_over(self._directory, earlier)
+        summary.particles = run.particle_count
+        if earlier is None:
+            stored = self.backend.on_cpu and run.batch.launch_cpu.is_there()
+            summary.outlook = self.check.outlook(stored=stored)
+            summary.compiling = None if stored else self.check.forecast.compile_seconds
+        self.on_start(summary)
+        self._open(header)
+        if not taken.replaces:
+            self._begin()
+        size, every = self.plan.particles * self.plan.bytes_per_particle, self.settings.checkpoint_every
+        checkpoints = Checkpointer(
+            self._directory, run, self._store, summary.backend, size=size, forced=self._forced, every=every
+        )
+        self._clock = Stopwatch(summary.timings, self.began)
+        failure: dict = {}
+        try:
+            self._compute(run, checkpoints)
+            summary.status = "finished"
+        except KeyboardInterrupt:
             halt.interrupted()
-        where = f"its frames were left unpacked, and stay readable in {store.place}"
-        if summary.path != summary.directory:
-            where = "the series was not written, which --resume does"
-        summary.status, summary.message = halt.status, f"{halt.message}; {where}"
-    except RunError as error:
+            summary.status, summary.message = halt.status, halt.message
+            failure = {"signal": halt.signal} if halt.signal else {}
+        except UnstableRunError as error:
+            summary.status, summary.message = "unstable", str(error)
+            failure = vars(error.diagnosis)
+        except DiskFullError as error:
+            summary.status, summary.message = "stopped", str(error)
+        except MpmcliError as error:
+            summary.status, summary.message = "failed", str(error)
+        except (RuntimeError, MemoryError) as error:
+            if not is_out_of_memory(error):
+                raise
+            summary.status, summary.message = "failed", out_of_memory_sentence(self.backend.arch, error)
+        finally:
+            if summary.status == "running" and not taken.replaces:
+                # A fault of mpmcli: the record must not state that the run continues.
+                self._record.close("failed", "an internal error ended the run")
+        summary.steps = run.step_count
+        if taken.replaces:
+            summary.message = f"{summary.message.rstrip('.')}; the earlier result in {self._directory} is kept."
+            taken.undo()
+            return summary
+        self._clock.book(run.first_step_seconds, "compile_s")
+        return self._close(failure)
+
+    def pack(self) -> RunSummary:
+        """Pack the frames of a run that has stored all of them, unless they are packed."""
+        summary, earlier, directory, form = self._summary, self.earlier, self._directory, self.settings.form
+        self.on_start(summary)
+        self._clock = Stopwatch(summary.timings, self.began)
+        packed = not sealed_segments(directory)
+        series = directory / SERIES
+        same = (directory / SCENE).read_text(encoding="utf-8") == self._text
+        done = packed and same and earlier.record["status"] == "finished"
+        summary.status = "finished"
+        if done and (form == "vtkhdf" or series.exists()):
+            summary.path = series if form == "vtk" else open_result(directory).path
+            return summary
+        take_over(directory, earlier)
+        self._open({**earlier.index.header, "scene": self._text})
+        self._write_scene()
+        return self._close({})
+
+    def _open(self, header: dict[str, Any]) -> None:
+        """Make the record and the store; they continue those of the earlier part."""
+        scene, summary, earlier = self._scene, self._summary, self.earlier
+        self._record = RunRecord(
+            self._directory,
+            command=self.settings.command,
+            backend=summary.backend,
+            seeds={one.name: one.seed for one in scene.sources if one.sampling in ("jittered", "poisson")},
+            forced=self._forced,
+            files=file_digests(self.loaded),
+            frames_expected=summary.frames_expected,
+            particles=summary.particles,
+            notes=summary.notes,
+            timings=summary.timings,
+        )
+        replace = self._begin if self.taken.replaces else None
+        options = {"compress": scene.output.compress, "colliders": scene.colliders, "replace_earlier": replace}
+        self._store = SegmentStore(self._directory, header, hold=HOLD, **options)
+        if earlier is not None:
+            self._record.go_on_from(earlier.record, earlier.rows, earlier.step)
+            if earlier.index is not None:
+                self._store.go_on_after(earlier.index)
+
+    def _begin(self, first: Path | None = None) -> None:
+        """Write the first files; remove an earlier result before, but not the `first` file of frames."""
+        if self.taken.replaces:
+            self.taken.clear(first)
+        self._record.write()
+        self._write_scene()
+
+    def _write_scene(self) -> None:
+        """Write the effective scene; RunError: the disk is full or a write failed."""
+        path = self._directory / SCENE
+        try:
+            write_text(path, self._text)
+        except OSError as error:
+            raise RunError(f"{path} could not be written ({error.strerror or error}).") from error
+
+    def _compute(self, run: Run, checkpoints: "Checkpointer") -> None:
+        """Compute and store each frame; the record and the summary count only sealed frames."""
+        store, record, summary, clock, halt = self._store, self._record, self._summary, self._clock, self._halt
+        rows: list[LedgerRow] = []
+        kept = store.frames_written
+
+        def after_step() -> bool:
+            with clock.adding("output_s"):
+                store.seal_due()
+            if store.frames_written > max(kept, summary.frames):
+                report()
+            ends = halt()
+            if ends or checkpoints.due():
+                checkpoints.take()
+            return ends
+
+        def report() -> None:
+            sealed = rows[summary.frames - kept : store.frames_written - kept]
+            with clock.adding("output_s"):
+                clock.book(run.first_step_seconds, "compile_s")
+                clock.book(run.frame_seconds + checkpoints.seconds, "output_s")
+                summary.steps, summary.time = run.step_count, run.time
+                summary.timings["watch_s"] = run.measure_seconds
+                for row in sealed:
+                    record.observe(row)
+                if sealed:
+                    record.write()
+            for row in sealed:
+                summary.frames += 1
+                summary.first, summary.last = summary.first or row, row
+                self.on_frame(row, summary)
+
+        frames = run.frames(after_step)
+        try:
+            while True:
+                with clock.adding("solve_s"):
+                    frame, row = next(frames, (None, None))
+                if frame is None:
+                    break
+                if frame.index >= kept:
+                    rows.append(row)
+                with clock.adding("output_s"):
+                    store.write(frame, row)
+                # Release the frame, whose memory the next one reuses.
+                del frame
+                report()
+                halt.wrote(store.bytes_written, store.seconds)
+        except BaseException:
+            # Report the first error.
+            with suppress(RunError):
+                store.seal()
+                report()
+            raise
+        with clock.adding("output_s"):
+            store.seal()
+            if checkpoints.taken:
+                # A final checkpoint permits resumption with a later end.
+                checkpoints.take()
+        report()
+
+    def _close(self, failure: Mapping[str, Any]) -> RunSummary:
+        """Pack the stored frames, close the record, and check a finished result as `mpmcli check` does.
+
+        A run interrupted before its first frame leaves no files. An interrupt or --max-time ends the check.
+        """
+        summary = self._summary
+        with self._clock.adding("output_s"):
+            self._finish()
+        if summary.status == "interrupted" and not summary.frames:
+            self.taken.undo()
+            return summary
+        self._record.close(summary.status, summary.message, **failure)
         if summary.status == "finished":
-            summary.status = "stopped" if isinstance(error, DiskFullError) else "failed"
-        summary.message = f"{summary.message} {error}".strip()
+            with suppress(KeyboardInterrupt):
+                summary.check = check_result(self._directory, self._halt.packing)
+        return summary
 
+    def _finish(self) -> None:
+        """Pack the stored frames, and also write them as a series if requested.
 
-def new_record(context: RunContext, summary: RunSummary) -> RunRecord:
-    """Return the record of a run, continued from that of an earlier part."""
-    earlier = context.earlier
-    record = RunRecord(
-        context.directory,
-        command=context.settings.command,
-        backend=summary.backend,
-        seeds={one.name: one.seed for one in context.scene.sources if one.sampling in ("jittered", "poisson")},
-        forced=context.forced,
-        files=file_digests(context.loaded),
-        frames_expected=summary.frames_expected,
-        particles=summary.particles,
-        notes=summary.notes,
-    )
-    if earlier is not None:
-        record.go_on_from(earlier.record, earlier.rows, earlier.step)
-    return record
+        Before that, the result is the directory with its sealed frames.
+        """
+        summary, halt, output = self._summary, self._halt, self._scene.output
+        summary.path = summary.directory
+        try:
+            summary.path = self._store.finish(halt.packing)
+            (self._directory / DAMAGED).unlink(missing_ok=True)
+            if self.settings.form == "vtk" and summary.path is not None:
+                options = {"compress": output.compress, "stop": halt.packing}
+                summary.path = write_series(self._directory, self._scene.colliders, **options)
+        except KeyboardInterrupt:
+            if not halt.status:
+                halt.interrupted()
+            where = f"its frames were left unpacked, and stay readable in {self._store.place}"
+            if summary.path != summary.directory:
+                where = "the series was not written, which --resume does"
+            summary.status, summary.message = halt.status, f"{halt.message}; {where}"
+        except RunError as error:
+            if summary.status == "finished":
+                summary.status = "stopped" if isinstance(error, DiskFullError) else "failed"
+            summary.message = f"{summary.message} {error}".strip()
 
 
 # Fraction of the wall time that checkpoints may take, and the shortest time between two, s.

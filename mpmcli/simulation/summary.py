@@ -1,6 +1,8 @@
 """Summary of a run: status, counts, first and last ledger rows, and timings."""
 
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -108,35 +110,29 @@ class Stopwatch:
 
     def __init__(self, timings: dict[str, float], began: float) -> None:
         self._timings = timings
-        self._began = began
-        self._key = ""
-        # Entry and start of each active with block, the innermost last.
-        self._open: list[tuple[str, float]] = []
+        self._began = self._since = began
+        self._key = "start_s"
         self._booked: dict[str, float] = {}
-        timings.update(start_s=time.perf_counter() - began, compile_s=0.0, solve_s=0.0, output_s=0.0, wall_s=0.0)
+        timings.update(start_s=0.0, compile_s=0.0, solve_s=0.0, output_s=0.0, wall_s=0.0)
+        self._add_time("")
 
-    def adding(self, key: str) -> "Stopwatch":
+    @contextmanager
+    def adding(self, key: str) -> Iterator[None]:
         """Add the time of a with block to an entry, without nested blocks, which count for their own entries."""
-        self._key = key
-        return self
+        outer = self._key
+        self._add_time(key)
+        try:
+            yield
+        finally:
+            self._add_time(outer)
 
-    def __enter__(self) -> None:
+    def _add_time(self, following: str) -> None:
+        """Add the time since the last call to the current entry, if there is one; another follows."""
         now = time.perf_counter()
-        self._add_innermost(now)
-        self._open.append((self._key, now))
-
-    def __exit__(self, *_: object) -> None:
-        now = time.perf_counter()
-        self._add_innermost(now)
-        self._open.pop()
-        if self._open:
-            self._open[-1] = self._open[-1][0], now
+        if self._key:
+            self._timings[self._key] += now - self._since
         self._timings["wall_s"] = now - self._began
-
-    def _add_innermost(self, now: float) -> None:
-        if self._open:
-            key, since = self._open[-1]
-            self._timings[key] += now - since
+        self._key, self._since = following, now
 
     def book(self, total: float, key: str) -> None:
         """Move seconds that the solver has spent on another task from solve_s to that task's entry."""
@@ -144,7 +140,3 @@ class Stopwatch:
         self._booked[key] = total
         self._timings["solve_s"] -= seconds
         self._timings[key] += seconds
-
-    def stop(self) -> None:
-        """Set the total."""
-        self._timings["wall_s"] = time.perf_counter() - self._began

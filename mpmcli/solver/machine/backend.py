@@ -75,6 +75,11 @@ class Backend:
     optimisation: Optimisation = "all"
 
     @property
+    def facts(self) -> dict[str, str | int]:
+        """The backend as in headers and records."""
+        return {"arch": self.arch, "threads": self.threads, "precision": self.precision}
+
+    @property
     def on_cpu(self) -> bool:
         """Whether kernels run on the CPU, where the scatter needs no atomics."""
         return self.arch == "cpu"
