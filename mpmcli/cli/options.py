@@ -14,12 +14,9 @@ class SceneOrResult(click.Path):
     """A path, or the name of an example scene if no file has that name."""
 
     def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> Path:
-        path = super().convert(value, param, ctx)
-        if path.suffix or path.parent != Path() or path.exists():
-            return path
-        from mpmcli.scene.examples import examples
+        from mpmcli.scene.examples import example_path
 
-        return examples().get(path.name, path)
+        return example_path(super().convert(value, param, ctx))
 
 
 SCENE = SceneOrResult(path_type=Path)

@@ -26,6 +26,7 @@ from mpmcli.dataset.folder import Row
 from mpmcli.dataset.shard import LABELS, MOVING, PENDING, QUARANTINE, TrajectoryData, file_name, write_single
 from mpmcli.dataset.sweep import Sweep
 from mpmcli.errors import InputError, RunError
+from mpmcli.extras import imported
 from mpmcli.materials.registry import load_plugins
 from mpmcli.output.checksums import path_digest
 from mpmcli.processes.pool import SPAWN, follow_parent, interrupts_blocked, sharing_cores, silence
@@ -404,14 +405,10 @@ def joined_workers(address: str) -> Iterator[ClusterWorkers]:
 
     For addresses tls:// the certificates are those of Dask's configuration.
     """
-    try:
-        from distributed import Client
-    except ImportError:
-        raise InputError('--scheduler needs Dask, which pip install "mpmcli[cluster]" installs.') from None
-
+    distributed = imported("distributed", "cluster", "--scheduler")
     with _quiet_dask():
         try:
-            client = Client(address, timeout=10)
+            client = distributed.Client(address, timeout=10)
         except (OSError, ValueError) as error:
             raise InputError(f"--scheduler {address}: no scheduler answers there; give tcp://HOST:PORT.") from error
         with client:

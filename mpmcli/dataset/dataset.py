@@ -1,7 +1,8 @@
-"""Reads a dataset: its trajectories by number, with arrays that are read on access."""
+"""Reads a dataset: its trajectories by number, with arrays that are read on access, and windows of their frames."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from mpmcli.dataset.folder import MANIFEST
 from mpmcli.dataset.report import MOST_NAMED, status_of
 from mpmcli.dataset.shard import LABELS, MOVING, SHARDS, SPLITS, SWEEP, TABLES, StoredGroup, moving_names, open_shard
 from mpmcli.errors import InputError
-from mpmcli.frames.frame import Frame
+from mpmcli.frames.frame import ACTIVE, STATUS, Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output import Result, open_result
 from mpmcli.output.collider_files import as_they_moved
@@ -20,9 +21,12 @@ from mpmcli.output.layout import PACKED, SEGMENTS, FrameLayout
 from mpmcli.output.run_record import RECORD
 from mpmcli.plain_text import counted
 from mpmcli.scene.colliders import Collider
+from mpmcli.scene.problem import listed, quoted
 
 Particles = slice | np.ndarray
 ALL = slice(None)
+# Trajectories whose tables and labels a process keeps.
+KEPT = 64
 
 
 class Trajectory(ABC):
@@ -45,6 +49,11 @@ class Trajectory(ABC):
     frames: np.ndarray
     particle_count: int
     field_names: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        end = f"{self.times[-1]:.4g} s" if len(self.times) else "its start"
+        counts = f"{counted(self.frame_count, 'frame')} to {end}, {counted(self.particle_count, 'particle')}"
+        return f"<Trajectory {self.number} ({self.split}): {', '.join((counts, *self.field_names))}>"
 
     @property
     def colliders(self) -> tuple[Collider, ...]:
@@ -223,6 +232,10 @@ class Dataset:
     def __len__(self) -> int:
         return len(self.numbers)
 
+    def __repr__(self) -> str:
+        counts = ", ".join(f"{split} {len(numbers)}" for split, numbers in self.splits.items() if numbers)
+        return f"<Dataset {self.path}: {counted(len(self), 'trajectory')} ({counts})>"
+
     def __iter__(self) -> Iterator[Trajectory]:
         return (self[number] for number in self.numbers)
 
@@ -235,6 +248,89 @@ class Dataset:
         if isinstance(self._source, Result):
             return _ResultTrajectory(self._source)
         return _StoredTrajectory(self._source[number], number)
+
+    @cached_property
+    def frame_counts(self) -> dict[int, int]:
+        """The number of frames of each trajectory, by its number."""
+        if isinstance(self._source, Result):
+            return {0: self._source.frame_count}
+        found = {}
+        for shard in sorted({*self._source.values()}):
+            with open_shard(shard) as file:
+                found |= {int(group.attrs["number"]): len(group["time"]) for group in file.values()}
+        return found
+
+    def windows(
+        self, split: str = "train", past: int = 6, future: int = 1, stride: int = 1, fields: Sequence[str] = ()
+    ) -> "Windows":
+        """Return all windows of consecutive frames of a split, a sequence as data loaders take it.
+
+        Args:
+            split: "train", "valid" or "test".
+            past, future: numbers of frames of a window that are input and target.
+            stride: number of stored frames from one frame of a window to the next; a window begins at every frame.
+            fields: further arrays of the past frames, "velocity" or fields of the trajectories.
+
+        Returns:
+            Windows, each a dictionary: `position` (past, N, d) and `target` (future, N, d), m; `time` (past + future,),
+            s; `body`, `material` (N,); `trajectory`, its number; each of `fields`, (past, N, ...); and `present` (past
+            + future, N), bool, if particles come or go. N differs between trajectories. Reading a window raises an
+            InputError for a damaged shard or an unknown field.
+
+        Raises:
+            InputError: there is no such split, or the numbers make no window.
+        """
+        return Windows(self, split, past, future, stride, tuple(fields))
+
+
+class Windows:
+    """A sequence of windows, each a dictionary of arrays; data loaders can copy it to their workers."""
+
+    def __init__(
+        self, dataset: Dataset, split: str, past: int, future: int, stride: int, fields: tuple[str, ...]
+    ) -> None:
+        if split not in SPLITS:
+            raise InputError(f'there is no split "{split}": the splits are {listed(quoted(SPLITS), "and")}.')
+        if min(past, stride) < 1 or future < 0:
+            raise InputError("a window has one past frame or more, 0 future frames or more, and a stride of 1 or more.")
+        self.dataset, self.past, self.future, self.stride, self.fields = dataset, past, future, stride, fields
+        self._numbers = dataset.splits[split]
+        self._reach = (past + future - 1) * stride + 1
+        counts = [max(0, dataset.frame_counts[number] - self._reach + 1) for number in self._numbers]
+        # The index of the first window after each trajectory.
+        self._ends = np.cumsum(counts, dtype=int)
+
+    def __len__(self) -> int:
+        return int(self._ends[-1]) if len(self._ends) else 0
+
+    def __getitem__(self, index: int) -> dict[str, np.ndarray]:
+        """Return a window, see `Dataset.windows`; IndexError: there is none."""
+        found = range(len(self))[index]
+        k = int(np.searchsorted(self._ends, found, side="right"))
+        trajectory, labels = _opened(self.dataset, self._numbers[k])
+        first = found - (int(self._ends[k - 1]) if k else 0)
+        frames = slice(first, first + self._reach, self.stride)
+        position = trajectory.read("position", frames)
+        window = {
+            "position": position[: self.past],
+            "target": position[self.past :],
+            "time": trajectory.times[frames],
+            **labels,
+            "trajectory": np.int64(trajectory.number),
+        }
+        if STATUS in trajectory.field_names:
+            window["present"] = trajectory.read(STATUS, frames) == ACTIVE
+        before = slice(first, first + (self.past - 1) * self.stride + 1, self.stride)
+        return window | {name: trajectory.read(name, before) for name in self.fields}
+
+    def __repr__(self) -> str:
+        return f"<Windows of {self.dataset.path}: {len(self)} of {self.past} and {self.future} frames>"
+
+
+@lru_cache(KEPT)
+def _opened(dataset: Dataset, number: int) -> tuple[Trajectory, dict[str, np.ndarray]]:
+    trajectory = dataset[number]
+    return trajectory, {name: trajectory.read(name) for name in LABELS}
 
 
 def is_dataset(path: Path) -> bool:

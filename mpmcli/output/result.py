@@ -1,23 +1,30 @@
 """Reads results: a packed file, or the directory of a finished, running or interrupted run."""
 
+import io
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from mpmcli.errors import InputError
-from mpmcli.frames.frame import STATUS, Frame
+from mpmcli.extras import imported
+from mpmcli.frames.frame import ACTIVE, STATUS, Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.checksums import DamageError, checksum, damaged, first_line
 from mpmcli.output.collider_files import as_they_moved, read_stored_surfaces
 from mpmcli.output.header import RunHeader
-from mpmcli.output.layout import PACKED, POSITION, SEGMENTS, STANDARD, FrameIndex, sealed_segments
+from mpmcli.output.layout import PACKED, POSITION, SEGMENTS, STANDARD, FrameIndex, ledger_csv, sealed_segments
 from mpmcli.output.run_record import read_record, run_status
 from mpmcli.output.vtkhdf import array_path, open_vtkhdf, read_index_of
+from mpmcli.plain_text import counted
 from mpmcli.scene.colliders import Collider
+
+if TYPE_CHECKING:
+    import pandas
+    import pyvista
 
 Kind = Literal["packed", "segments"]
 
@@ -104,6 +111,31 @@ class Result(ABC):
         """Read all frames, one at a time."""
         for k in range(self.frame_count):
             yield self.frame(k, fields)
+
+    def __repr__(self) -> str:
+        count = int(self.particle_counts.max())
+        times = f"{counted(self.frame_count, 'frame')} from {self.times[0]:.4g} to {self.times[-1]:.4g} s"
+        what = f"{self.dimension}D, {times}, {counted(count, 'particle')}"
+        return f"<Result {self.path}: {', '.join((what, *self.field_names))}; {self.status}>"
+
+    def dataframe(self) -> "pandas.DataFrame":
+        """Return the ledger as a pandas table with a row for each frame; InputError: pandas is not installed."""
+        table = imported("pandas", "pandas", "a ledger as a table")
+        index = zip(self.numbers.tolist(), self.index.steps.tolist(), self.particle_counts.tolist(), strict=True)
+        return table.read_csv(io.StringIO(ledger_csv(self.ledger, list(index))))
+
+    def to_pyvista(self, k: int) -> "pyvista.PolyData":
+        """Return the particles present in the k-th frame as points with their arrays, z = 0 in 2D."""
+        import pyvista
+
+        arrays = self.stored(k)
+        if STATUS in arrays:
+            present = arrays[STATUS] == ACTIVE
+            arrays = {name: array[present] for name, array in arrays.items()}
+        cloud = pyvista.PolyData(arrays.pop(POSITION))
+        for name, array in arrays.items():
+            cloud.point_data[name] = array
+        return cloud
 
     @abstractmethod
     def _read(self, k: int, names: Sequence[str]) -> dict[str, np.ndarray]:

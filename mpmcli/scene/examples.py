@@ -14,6 +14,11 @@ def examples() -> dict[str, Path]:
     return {path.stem: path for path in sorted(directory.glob("*.toml"))}
 
 
+def example_path(path: Path) -> Path:
+    """Return the file of an example if a path is its name and no file has that name, else the path."""
+    return path if path.suffix or path.parent != Path() or path.exists() else examples().get(path.name, path)
+
+
 def caption(path: Path) -> str:
     """Return the caption of an example from its header."""
     text = path.read_text(encoding="utf-8")

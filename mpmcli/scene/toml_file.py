@@ -350,19 +350,20 @@ def _blocks(name: str, value: object) -> Iterator[str]:
                 for key, table in inner.items():
                     yield _table(f"[{name}.{key}]", table)
         case _:
-            yield f"{name} = {_value_text(value)}"
+            yield f"{name} = {value_text(value)}"
 
 
 def _table(header: str, table: dict[str, Any]) -> str:
-    return "\n".join([header, *(f"{key} = {_value_text(value)}" for key, value in table.items())])
+    return "\n".join([header, *(f"{key} = {value_text(value)}" for key, value in table.items())])
 
 
-def _value_text(value: object) -> str:
+def value_text(value: object) -> str:
+    """Return a value as TOML; TypeError: it is none."""
     match value:
         case dict():
-            return "{ " + ", ".join(f"{key} = {_value_text(inner)}" for key, inner in value.items()) + " }"
+            return "{ " + ", ".join(f"{key} = {value_text(inner)}" for key, inner in value.items()) + " }"
         case list() | tuple():
-            inner = [_value_text(entry) for entry in value]
+            inner = [value_text(entry) for entry in value]
             if inner and len(inner) * len(inner[0]) > _WIDTH:
                 return "[\n    " + ",\n    ".join(inner) + ",\n]"
             return f"[{', '.join(inner)}]"
