@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from command import ROOT
 
+from mpmcli.dataset.formats import FORMATS
 from mpmcli.materials.registry import parameter_models
 from mpmcli.output import open_result
 from mpmcli.output.layout import COLUMNS
@@ -227,6 +228,11 @@ def test_three_lines_of_h5py_read_a_result(commands, checkout, monkeypatch):
         np.testing.assert_array_equal(names["file"]["VTKHDF/Steps/Values"][:], result.times)
     finally:
         names["file"].close()
+
+
+def test_the_table_of_formats_is_that_of_the_help():
+    rows = [f"| `{name}` | {what} |" for name, (_, what) in FORMATS.items()]
+    assert "\n".join(["| --- | --- |", *rows, ""]) in PAGES["docs/datasets.md"]
 
 
 def test_the_table_of_the_ledger_is_complete():

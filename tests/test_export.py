@@ -21,7 +21,7 @@ from test_dataset_statistics import agree, plain
 
 import mpmcli.dataset
 from mpmcli.dataset.folder import MANIFEST, Manifest, Row
-from mpmcli.dataset.formats import FORMATS
+from mpmcli.dataset.formats import FORMATS, format_named
 from mpmcli.dataset.subsample import chosen_particles, joined_row
 from mpmcli.materials.registry import laws as registered
 from mpmcli.materials.registry import parameter_models
@@ -474,6 +474,8 @@ def test_the_same_export_has_the_same_bytes(tmp_path, form):
         assert run_here("export", path, "--to", form, "-o", tmp_path / name, "-q").status == 0
         files.append({p.name: p.read_bytes() for p in (tmp_path / name).iterdir()})
     assert files[0] == files[1]
+    assert run_here("export", path, "--to", form, "-o", tmp_path / "b", "--overwrite").status == 0
+    assert {p.name: p.read_bytes() for p in (tmp_path / "b").iterdir()} == files[0]
 
 
 def test_an_earlier_export_is_replaced_only_when_asked(tmp_path):
@@ -589,7 +591,7 @@ def test_the_answer_is_a_line_on_stdout(tmp_path):
 def test_a_law_keeps_its_type_whatever_the_others_are(tmp_path):
     """Nine types hold all laws of mpmcli and one more for GNS, and all but one for LagrangeBench."""
     for form, taken in (("gns", {3}), ("lagrangebench", {1, 2, 3})):
-        learner = FORMATS[form]
+        learner = format_named(form)
         free = set(range(9)) - taken
         assert set(learner.usual.values()) <= free and set(learner.free) <= free
         assert len(set(learner.usual.values())) == len(learner.usual)

@@ -11,6 +11,7 @@ from mpmcli.cli import options
 from mpmcli.cli.interrupt import interrupt_came, interrupted_code, interrupts_wait
 from mpmcli.cli.options import COUNT, PATH, json_option, quiet_option
 from mpmcli.cli.streams import print_answer, print_json, print_note, print_text
+from mpmcli.dataset.formats import FORMATS
 from mpmcli.errors import InputError
 
 # Time in which the workers of a sweep and this process end, s.
@@ -166,9 +167,9 @@ def merge(parts: tuple[Path, ...], output: Path, as_json: bool) -> None:
 @click.option(
     "--to",
     "form",
-    type=click.Choice(["lagrangebench", "gns", "npz", "vtkhdf", "vtk"]),
+    type=click.Choice([*FORMATS]),
     required=True,
-    help="The training code of LagrangeBench or GNS, NumPy, or ParaView and all commands that read results.",
+    help="\b\n" + "\n".join(f"{name}: {what}" for name, (_, what) in FORMATS.items()),
 )
 @click.option("-o", "--output", "directory", type=PATH, required=True, metavar="DIR", help="Output directory.")
 @click.option("--trajectory", type=click.IntRange(min=0), metavar="N", help="Only the trajectory with this number.")

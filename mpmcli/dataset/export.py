@@ -13,7 +13,7 @@ from typing import Any
 
 from mpmcli.dataset.dataset import Dataset
 from mpmcli.dataset.folder import MANIFEST
-from mpmcli.dataset.formats import FORMATS
+from mpmcli.dataset.formats import FORMATS, format_named
 from mpmcli.dataset.metadata import EXPORTED_BY, common_facts
 from mpmcli.dataset.report import status_of
 from mpmcli.dataset.shard import SPLITS
@@ -27,7 +27,6 @@ from mpmcli.plain_json import finite_json
 from mpmcli.plain_text import counted, size_text
 
 METADATA = "metadata.json"
-_OURS = re.compile(r"metadata\.json|checksums\.sha256|(train|valid|test)\.(h5|npz)|\d{6,}\.(npz|vtkhdf)")
 
 
 @dataclass(frozen=True)
@@ -118,7 +117,7 @@ def export(
         metadata["particle_seed"] = SEED
     if settings.features is not None and settings.form != "gns":
         raise InputError("--features is for --to gns: leave it out.")
-    form = FORMATS[settings.form](chosen, settings.features)
+    form = format_named(settings.form)(chosen, settings.features)
     form.check()
     for each in chosen:
         walls = each.walls
@@ -158,7 +157,8 @@ def check_export_directory(directory: Path, overwrite: bool) -> None:
     if not directory.is_dir():
         return
     names = [path.name for path in directory.iterdir()]
-    foreign = sorted(name for name in names if not _OURS.fullmatch(name))
+    ours = re.compile("|".join([*map(re.escape, (METADATA, SUMS)), *(format_named(form).files for form in FORMATS)]))
+    foreign = sorted(name for name in names if not ours.fullmatch(name))
     if names and (foreign or EXPORTED_BY not in _metadata(directory)):
         what = f"it holds {foreign[0]}" if foreign else f"it has no {METADATA} of mpmcli export"
         raise InputError(f"{directory} is not an earlier export, as {what}: give another directory with -o.")

@@ -1,0 +1,22 @@
+"""The formats of exports: one file each, loaded on use; docs/architecture.md says how to add one."""
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from mpmcli.dataset.formats.format import Format
+
+# Name for --to; module and class; files and their readers, for --help and docs/datasets.md, which load no modules.
+FORMATS = {
+    "lagrangebench": ("lagrangebench.LagrangeBench", "train.h5, valid.h5, test.h5 for LagrangeBench"),
+    "gns": ("gns.Gns", "train.npz, valid.npz, test.npz for GNS"),
+    "npz": ("npz.Npz", "a file of plain arrays per trajectory, for NumPy"),
+    "vtkhdf": ("vtk.Vtkhdf", "a result per trajectory, for ParaView and every command of mpmcli"),
+    "vtk": ("vtk.Vtk", "a .vtu per frame and a .pvd, for ParaView before 5.12"),
+}
+
+
+def format_named(name: str) -> "type[Format]":
+    """Return the class of a format."""
+    module, kind = FORMATS[name][0].split(".")
+    return getattr(import_module(f"{__name__}.{module}"), kind)
