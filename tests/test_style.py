@@ -38,7 +38,6 @@ TAICHI_ROOMS = {"solver", "materials", "boundaries", "quick_taichi"}
 # These know frames and files, never the device state; the solver knows no store.
 BARRED = {"solver": "output", "render": "solver", "plot": "solver", "output": "solver", "dataset": "solver"}
 HEAVY = {"taichi", "numpy", "h5py", "pydantic", "vtk", "vtkmodules", "pyvista", "meshio", "matplotlib", "PIL"}
-# A guide: what belongs together stays together.
 
 
 def name_of(path: Path) -> str:

@@ -15,25 +15,36 @@ from mpmcli.cli.streams import flush_streams, print_error
 from mpmcli.cli.supervisor import may_supervise, supervise
 from mpmcli.errors import InputError, MpmcliError
 
-# Name of each command, the module with its NAME_command, and its help line, so that help loads no modules.
-COMMANDS = {
-    "simulate": ("simulate", "Run a scene and store its particles."),
-    "new": ("materials", "List the example scenes, or copy one."),
-    "check": ("inspection", "Say which step is safe and why, or whether a result stayed stable."),
-    "warm": ("simulate", "Compile the kernels of scenes ahead."),
-    "sweep": ("dataset", "Compute a dataset of many varied runs."),
-    "dataset": ("dataset", "Count, verify and merge datasets."),
-    "info": ("inspection", "Say what a result or a scene holds, and whether it has changed."),
-    "render": ("pictures", "Draw frames of a result: pictures, films, montages."),
-    "plot": ("pictures", "Draw a result's ledger: energies, momentum, steps, volumes, reach."),
-    "export": ("dataset", "Write a dataset or a result for training code, NumPy or ParaView."),
-    "materials": ("materials", "List laws, presets, their parameters and knobs."),
-    "schema": ("materials", "Print the JSON Schema of scenes, for editors."),
-    "validate": ("validate", "Measure speed against error on problems with known answers."),
-    "bench": ("validate", "Compare speed with the MPM examples that Taichi ships."),
-    "doctor": ("inspection", "Say whether everything that mpmcli needs works here."),
-    "completion": ("program", "Print the script that completes commands in a shell."),
+# By group: name of each command, the module with its NAME_command, and its help line, so that help loads no modules.
+GROUPS = {
+    "Start": {
+        "new": ("materials", "List the example scenes, or copy one."),
+        "check": ("inspection", "Say which step is safe and why, or whether a result is stable."),
+        "simulate": ("simulate", "Run a scene and store its particles."),
+        "materials": ("materials", "List laws, presets, their parameters and knobs."),
+    },
+    "Look": {
+        "info": ("inspection", "Say what a result or a scene holds, and whether it has changed."),
+        "render": ("pictures", "Draw frames of a result: pictures, films, montages."),
+        "plot": ("pictures", "Draw the ledger of a result: energies, momentum, steps, ..."),
+    },
+    "Datasets": {
+        "sweep": ("dataset", "Compute a dataset of many varied runs."),
+        "dataset": ("dataset", "Count, verify and merge datasets."),
+        "export": ("dataset", "Write a dataset or a result for learning, NumPy or ParaView."),
+    },
+    "Trust": {
+        "validate": ("validate", "Measure speed against error on problems with known answers."),
+        "bench": ("validate", "Compare speed with the MPM examples that Taichi ships."),
+    },
+    "Maintenance": {
+        "doctor": ("inspection", "Say whether everything that mpmcli needs works here."),
+        "warm": ("simulate", "Compile the kernels of scenes ahead."),
+        "schema": ("materials", "Print the JSON Schema of scenes, for editors."),
+        "completion": ("program", "Print the script that completes commands in a shell."),
+    },
 }
+COMMANDS = {name: told for group in GROUPS.values() for name, told in group.items()}
 
 # Faults of the disk that any file may meet.
 DISK_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)
@@ -61,8 +72,10 @@ class LazyGroup(click.Group):
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        with formatter.section("Commands"):
-            formatter.write_dl([(name, line) for name, (_, line) in COMMANDS.items()])
+        width = max(map(len, COMMANDS))
+        for group, commands in GROUPS.items():
+            with formatter.section(group):
+                formatter.write_dl([(f"{name:<{width}}", line) for name, (_, line) in commands.items()])
 
 
 @click.group(cls=LazyGroup, invoke_without_command=True, context_settings={"help_option_names": ["-h", "--help"]})
