@@ -1,9 +1,27 @@
-"""Sections of the pages under docs/ that a command writes: the lines between a pair of markers."""
+"""Sections of the pages under docs/ that a command writes, and the results of the example scenes that they show."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"
+PICTURES = DOCS / "pictures"
+RESULTS = ROOT / "results" / "scene_table"
+
+
+def run(*words: object) -> str:
+    """Run mpmcli and return what it prints."""
+    command = [sys.executable, "-m", "mpmcli", *map(str, words)]
+    return subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, check=True).stdout
+
+
+def result_of(name: str) -> Path:
+    """Return the result of an example scene, which is run if there is none."""
+    result = RESULTS / name
+    if not (result / "particles.vtkhdf").exists():
+        run("simulate", f"configs/{name}.toml", "-o", result, "--overwrite", "--quiet")
+    return result
 
 
 def page_of(name: str) -> Path:

@@ -29,6 +29,10 @@ PAGES = {"README.md": README} | {
 
 # Commands that are run in a shorter form. The README gives the one of the demo itself.
 SHORTER = {
+    "mpmcli simulate rafts_2d --set time.frames=30": "mpmcli simulate rafts_2d --set time.frames=3 --set time.end=0.02",
+    "mpmcli render results/rafts_2d --mode fluid --movie results/rafts.mp4": (
+        "mpmcli render results/rafts_2d --mode fluid --size 320x240 --movie results/rafts.mp4"
+    ),
     "scripts/demo": "scripts/demo --overwrite --set time.end=0.1 --set time.frames=5",
     # A worker more compiles the same kernel once more; test_sweep_run.py has two.
     "mpmcli sweep configs/sweeps/sand_boxes_2d.toml --count 8 -o results/sand_boxes": (

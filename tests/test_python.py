@@ -57,6 +57,12 @@ def test_the_page_runs_and_a_run_has_the_bytes_of_the_command(tmp_path: Path, ru
     assert files[0].read_bytes() == files[1].read_bytes()
 
 
+def test_the_readme_runs(tmp_path: Path, run_python: Callable) -> None:
+    (code,) = blocks("python", README)
+    short = code.replace('"time.frames": 30', '"time.end": 0.02, "time.frames": 30')
+    assert short != code and run_python(f"{short}\nprint(position.shape)").stdout.startswith("(12000, 2)")
+
+
 def test_the_package_is_light_until_a_function_is_asked_for(run_python: Callable) -> None:
     code = "import mpmcli, sys; print(len([m for m in sys.modules if m.startswith('mpmcli')])); print(dir(mpmcli))"
     count, names = run_python(code).stdout.splitlines()
