@@ -13,11 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command import run_here
-from made_dataset import SPLITS, made_trajectory, write_dataset
+from made_dataset import SPLITS, made_dataset, made_trajectory, write_dataset
 from made_result import write_made
 from made_sweep import COUNT, VERDICTS, made_workers, make_dataset  # noqa: F401
 
 import mpmcli.dataset
+from mpmcli.dataset.subsample import SubsampledTrajectory
 from mpmcli.output import open_result
 
 INPUTS = 6
@@ -61,6 +62,38 @@ def test_load_dataset_has_the_splits_without_the_quarantine() -> None:
         assert all(json.loads(row["draws"]) == opened[row["number"]].draws for row in found["splits"][split])
     loaded = {row["number"] for rows in found["splits"].values() for row in rows}
     assert loaded == {*range(COUNT)} - {*VERDICTS} and any((path / "quarantine").iterdir())
+
+
+PARQUET = """
+import json, sys
+from datasets import load_dataset
+whole, found = load_dataset(sys.argv[1], cache_dir="cache"), {}
+for split, rows in load_dataset(sys.argv[1], streaming=True).items():
+    found[split] = list(rows)
+    assert found[split] == whole[split].to_list()
+    for row, arrays in zip(found[split], whole[split].with_format("numpy")):
+        assert arrays["position"].tolist() == row["position"] and arrays["position"].dtype == "float32"
+print(json.dumps({"splits": found, "position": repr(whole["train"].features["position"])}))
+"""
+
+
+@pytest.mark.parametrize("most", [None, 20], ids=["lists", "arrays"])
+def test_load_dataset_reads_parquet_to_the_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: int | None) -> None:
+    """Plain, streaming and as arrays of NumPy; numbers of particles that differ, and equal ones."""
+    pytest.importorskip("pyarrow")
+    monkeypatch.chdir(tmp_path)
+    path, options = made_dataset(tmp_path / "set"), ["--max-particles", most] if most else []
+    assert run_here("export", path, "--to", "parquet", "-o", tmp_path / "out", *options).status == 0
+    found, dataset = told(environment("datasets"), PARQUET, tmp_path / "out"), mpmcli.dataset.open(path)
+    assert found["position"].startswith("Array3D(shape=(11, 20, 2)" if most else "List(List(List(")
+    for split, numbers in dataset.splits.items():
+        assert [row["number"] for row in found["splits"][split]] == list(numbers)
+        for row in found["splits"][split]:
+            source = SubsampledTrajectory(dataset[row["number"]], most=most)
+            assert json.loads(row["draws"]) == source.source.draws
+            for name in ("position", "velocity", "pressure", "deformation_gradient"):
+                np.testing.assert_array_equal(np.array(row[name], np.float32), source.read(name))
+            assert row["time"] == source.times.tolist() and row["body"] == source.label("body").tolist()
 
 
 GNS = """

@@ -4,17 +4,19 @@ import json
 import os
 import pickletools
 import shutil
+import sys
 import tomllib
 import zipfile
 from collections import namedtuple
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 import pyvista
-from command import run_here
+from command import ROOT, run_here
 from made_dataset import COUNTS, PAUSE, SPLITS, made_dataset, made_header, made_trajectory, write_dataset
 from made_result import write_made
 from test_dataset_statistics import agree, plain
@@ -29,7 +31,10 @@ from mpmcli.output import open_result
 from mpmcli.output.header import RunHeader
 from mpmcli.scene import parse_scene, scene_to_toml
 
-FORMS = tuple(FORMATS)
+FORMS = [
+    pytest.param(form, marks=pytest.mark.skipif(find_spec(package or "numpy") is None, reason=f"{package} is absent"))
+    for form, package in ((form, format_named(form).package) for form in FORMATS)
+]
 FRAMES, INPUTS = 11, 6
 
 
@@ -410,6 +415,50 @@ def test_vtkhdf_of_a_dataset_opens_as_a_result(tmp_path, dimension):
     np.testing.assert_array_equal(mpmcli.dataset.open(result.path)[0].position, source.position)
 
 
+def test_a_table_of_parquet_is_divided_and_has_arrays_where_shapes_agree(tmp_path, monkeypatch):
+    """Files as large as allowed, in order; README.md gives fixed shapes to columns whose trajectories agree."""
+    reader = pytest.importorskip("pyarrow.parquet")
+    path = made_dataset(tmp_path / "set", dtype=np.float64)
+    exported(path, "parquet", tmp_path / "out")
+    card = (tmp_path / "out" / "README.md").read_text()
+    assert '{"name": "position", "list": {"list": {"list": "float64"}}}' in card
+    # The trajectories have 11 frames of 30 and 24 particles with 2 + 2 + 1 + 4 numbers, and 3 with --max-particles.
+    monkeypatch.setattr("mpmcli.dataset.formats.arrays.FILE_BYTES", 11 * 3 * 9 * 8 + 1000)
+    answer = exported(path, "parquet", tmp_path / "out", "--max-particles", 3, "--overwrite")
+    files = [name for name in answer["files"] if name.startswith("train")]
+    assert files == ["train-00000-of-00002.parquet", "train-00001-of-00002.parquet"]
+    card = (tmp_path / "out" / "README.md").read_text()
+    assert '{"name": "position", "dtype": {"array3_d": {"shape": [11, 3, 2], "dtype": "float64"}}}' in card
+    source = mpmcli.dataset.open(path)
+    for number, file in enumerate(files):
+        (row,) = reader.read_table(tmp_path / "out" / file).to_pylist()
+        chosen = chosen_particles(source[number].body, 3, number)
+        assert row["number"] == number and json.loads(row["draws"]) == source[number].draws
+        for name in ("position", "pressure", "deformation_gradient"):
+            np.testing.assert_array_equal(row[name], source[number].read(name, particles=chosen))
+        assert row["body"] == source[number].body[chosen].tolist() and row["time"] == source[number].times.tolist()
+
+
+def test_a_table_of_parquet_has_the_same_columns_in_all_rows(tmp_path):
+    pytest.importorskip("pyarrow")
+    made = [made_trajectory(0), made_trajectory(1)]
+    del made[1].fields["pressure"]
+    path = write_dataset(tmp_path / "set", made)
+    assert "0 and 1 differ in having the field pressure" in refused(path, "parquet", tmp_path / "out")
+    path = write_dataset(tmp_path / "other", [made_trajectory(0), made_trajectory(1, dtype=np.float64)])
+    assert "position has different types" in refused(path, "parquet", tmp_path / "out")
+
+
+@pytest.mark.parametrize("form", [form for form in FORMATS if format_named(form).package])
+def test_a_missing_package_is_named_with_its_extra(tmp_path, monkeypatch, form):
+    known = format_named(form)
+    monkeypatch.setitem(sys.modules, known.package, None)
+    message = refused(made_dataset(tmp_path / "set"), form, tmp_path / "out")
+    assert f'--to {form} needs {known.package}, which pip install "mpmcli[{known.extra}]" installs.' in message
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert any(one.startswith(known.package) for one in project["optional-dependencies"][known.extra])
+
+
 def test_ledgers_of_left_out_frames_are_joined(tmp_path):
     path = made_dataset(tmp_path / "set")
     exported(path, "vtkhdf", tmp_path / "out", "--stride", 4)
@@ -437,6 +486,9 @@ def test_fewer_particles_are_the_same_ones_in_every_format_and_frame(tmp_path, f
         found = GnsReader(tmp_path / "out" / "train.npz").data[0][0]
     elif form == "npz":
         found = np.load(tmp_path / "out" / "000000.npz")["position"]
+    elif form == "parquet":
+        table = pytest.importorskip("pyarrow.parquet").read_table(tmp_path / "out" / "train-00000-of-00001.parquet")
+        found = np.array(table["position"][0].as_py(), np.float32)
     elif form == "vtk":
         files = sorted((tmp_path / "out").glob("000000_*.vtu"))
         found = np.stack([pyvista.read(file).points[:, :2] for file in files])

@@ -11,6 +11,7 @@ FORMATS = {
     "lagrangebench": ("lagrangebench.LagrangeBench", "train.h5, valid.h5, test.h5 for LagrangeBench"),
     "gns": ("gns.Gns", "train.npz, valid.npz, test.npz for GNS"),
     "npz": ("npz.Npz", "a file of plain arrays per trajectory, for NumPy"),
+    "parquet": ("parquet.Parquet", "a table per split and README.md, for load_dataset of Hugging Face"),
     "vtkhdf": ("vtk.Vtkhdf", "a result per trajectory, for ParaView and every command of mpmcli"),
     "vtk": ("vtk.Vtk", "a .vtu per frame and a .pvd, for ParaView before 5.12"),
 }

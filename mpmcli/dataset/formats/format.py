@@ -2,10 +2,12 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, ClassVar
 
 from mpmcli.dataset.subsample import SubsampledTrajectory
+from mpmcli.errors import InputError
 
 # Entries of a format in metadata.json, and notes for the user.
 Written = tuple[dict[str, Any], list[str]]
@@ -16,14 +18,21 @@ class Format(ABC):
 
     Attributes:
         files: pattern of the names of its files.
-        extra: the extra of mpmcli that installs what it needs; None if it needs nothing more.
+        package, extra: a package that it needs, and the extra of mpmcli that installs it; None if it needs none.
     """
 
     files: ClassVar[str]
+    package: ClassVar[str | None] = None
     extra: ClassVar[str | None] = None
 
     def __init__(self, trajectories: Sequence[SubsampledTrajectory], features: tuple[str, ...] | None = None) -> None:
-        """`features` are the material parameters that GNS gets, None for those that differ."""
+        """Raise an InputError if a package is missing.
+
+        `features` are the material parameters that GNS gets, None for those that differ.
+        """
+        if self.package and find_spec(self.package) is None:
+            name = type(self).__name__.lower()
+            raise InputError(f'--to {name} needs {self.package}, which pip install "mpmcli[{self.extra}]" installs.')
         self.trajectories, self._features = trajectories, features
 
     def check(self) -> None:  # noqa: B027

@@ -1,0 +1,135 @@
+"""Tables of Parquet as `load_dataset` of Hugging Face reads them: a row per trajectory."""
+
+import json
+from collections.abc import Callable
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mpmcli.dataset.formats.arrays import ArraysFormat, ExportedArray, arrays_of
+from mpmcli.dataset.shard import SPLITS
+from mpmcli.errors import InputError
+
+# Arrays of datasets have up to five axes.
+MOST_AXES = 5
+_CARD = """\
+---
+configs:
+- config_name: default
+  data_files:
+{files}
+dataset_info:
+  features:
+{features}
+---
+
+# {title}
+
+Trajectories of particles computed with mpmcli, one in each row; lengths in m, times in s. `metadata.json` has spacings,
+the names of laws and bodies, and statistics of motion.
+
+```python
+from datasets import load_dataset
+dataset = load_dataset(".").with_format("numpy")
+position = dataset["{split}"][0]["position"]    # (T, N, {dimension})
+```
+"""
+
+
+class Parquet(ArraysFormat):
+    """A table per split, in files of at most 500 MB, and README.md with the splits and the types of columns.
+
+    Columns are the number and the draws (JSON) of a trajectory, and its arrays as nested lists. The column of an array
+    whose axes have the same length in all trajectories, but for the first, is an Array2D to Array5D of datasets: these
+    become arrays of NumPy a hundred times faster than lists. A trajectory without an array has null.
+    """
+
+    files = r"(train|valid|test)-\d{5}-of-\d{5}\.parquet|README\.md"
+    package, extra = "pyarrow", "huggingface"
+
+    def check(self) -> None:
+        moving = {each.source.number: each.source.field_names for each in self.trajectories}
+        first = self.trajectories[0].source.number
+        for number, names in moving.items():
+            if set(names) != set(moving[first]):
+                name = min(set(names) ^ set(moving[first]))
+                raise InputError(
+                    f"trajectories {first} and {number} differ in having the field {name}: a table has the same "
+                    "columns in all rows; --to npz takes trajectories that differ."
+                )
+        for name, found in self._columns.items():
+            if len({(array.dtype, len(array.shape)) for array in found}) > 1:
+                raise InputError(
+                    f"{name} has different types in the trajectories: a table has one type in each column; --to npz "
+                    "takes trajectories that differ."
+                )
+
+    @cached_property
+    def _columns(self) -> dict[str, list[ExportedArray]]:
+        """The array of each trajectory that has it, without its content, by name."""
+        found: dict[str, list[ExportedArray]] = {}
+        for each in self.trajectories:
+            for name, array in arrays_of(each).items():
+                found.setdefault(name, []).append(ExportedArray(array.dtype, array.shape, tuple))
+        return found
+
+    def _feature(self, name: str) -> dict[str, Any]:
+        """Return the type of a column for datasets."""
+        found = self._columns[name]
+        dtype, axes = found[0].dtype.name, len(found[0].shape)
+        alike = len({array.shape[1:] for array in found}) == 1 and len(found) == len(self.trajectories)
+        if alike and 1 < axes <= MOST_AXES:
+            lengths = {array.shape[0] for array in found}
+            shape = [lengths.pop() if len(lengths) == 1 else None, *found[0].shape[1:]]
+            return {"name": name, "dtype": {f"array{axes}_d": {"shape": shape, "dtype": dtype}}}
+        kind: Any = dtype
+        for _ in range(axes):
+            kind = {"list": kind}
+        return {"name": name, **kind}
+
+    def write_arrays(self, directory: Path, tick: Callable[[], None]) -> None:
+        import pyarrow as pa
+        from pyarrow.parquet import ParquetWriter
+
+        types = {"number": pa.int64(), "draws": pa.string()}
+        for name, found in self._columns.items():
+            types[name] = pa.from_numpy_dtype(found[0].dtype)
+            for _ in found[0].shape:
+                types[name] = pa.list_(types[name])
+        for file, chosen in self.parts():
+            path = directory / f"{file}.parquet"
+            with ParquetWriter(path, pa.schema(types), compression="none", use_dictionary=False) as writer:
+                for each in chosen:
+                    row = {"number": [each.source.number], "draws": [json.dumps(each.source.draws)]}
+                    row |= {name: _nested(array.read()) for name, array in arrays_of(each).items()}
+                    columns = [pa.array(row.get(name, [None]), kind) for name, kind in types.items()]
+                    writer.write_batch(pa.record_batch(columns, schema=pa.schema(types)))
+                    tick()
+        (directory / "README.md").write_text(self._card(), encoding="utf-8", newline="\n")
+
+    def _card(self) -> str:
+        there = {each.source.split for each in self.trajectories}
+        splits = [split for split in SPLITS if split in there]
+        features = [{"name": "number", "dtype": "int64"}, {"name": "draws", "dtype": "string"}]
+        features += map(self._feature, self._columns)
+        first = self.trajectories[0]
+        return _CARD.format(
+            files="\n".join(f"  - split: {split}\n    path: {split}-*.parquet" for split in splits),
+            features="\n".join(f"  - {json.dumps(feature)}" for feature in features),
+            title=first.source.header.title or "Trajectories of particles",
+            split=splits[0],
+            dimension=first.layout.dimension,
+        )
+
+
+def _nested(array: np.ndarray) -> Any:
+    """Return an array of pyarrow of one row, a nested list."""
+    import pyarrow as pa
+
+    found = pa.array(array.reshape(-1))
+    for axis in reversed(range(array.ndim)):
+        offsets = np.arange(int(np.prod(array.shape[:axis])) + 1) * array.shape[axis]
+        found = pa.ListArray.from_arrays(pa.array(offsets, pa.int32()), found)
+    return found
