@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command import run_here
-from made_dataset import SPLITS, made_dataset, made_trajectory, write_dataset
+from made_dataset import PAUSE, SPLITS, made_dataset, made_trajectory, write_dataset
 from made_result import write_made
 from made_sweep import COUNT, VERDICTS, made_workers, make_dataset  # noqa: F401
 
@@ -78,7 +78,9 @@ print(json.dumps({"splits": found, "position": repr(whole["train"].features["pos
 
 
 @pytest.mark.parametrize("most", [None, 20], ids=["lists", "arrays"])
-def test_load_dataset_reads_parquet_to_the_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: int | None) -> None:
+def test_load_dataset_reads_parquet_to_the_bit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most: int | None
+) -> None:
     """Plain, streaming and as arrays of NumPy; numbers of particles that differ, and equal ones."""
     pytest.importorskip("pyarrow")
     monkeypatch.chdir(tmp_path)
@@ -94,6 +96,32 @@ def test_load_dataset_reads_parquet_to_the_bit(tmp_path: Path, monkeypatch: pyte
             for name in ("position", "velocity", "pressure", "deformation_gradient"):
                 np.testing.assert_array_equal(np.array(row[name], np.float32), source.read(name))
             assert row["time"] == source.times.tolist() and row["body"] == source.label("body").tolist()
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_zarr_opens_a_group_for_each_trajectory(tmp_path: Path, dtype: type, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Consolidated, with all arrays, in chunks of frames, and with attributes as in metadata.json."""
+    zarr = pytest.importorskip("zarr")
+    # Chunks of two frames of 30 particles, written in blocks of three.
+    monkeypatch.setattr("mpmcli.dataset.formats.zarr.CHUNK_BYTES", 2 * 30 * 2 * np.dtype(dtype).itemsize)
+    monkeypatch.setattr("mpmcli.dataset.subsample.BLOCK_BYTES", 3 * 36 * 2 * np.dtype(dtype).itemsize)
+    path = made_dataset(tmp_path / "set", dtype=dtype)
+    assert run_here("export", path, "--to", "zarr", "-o", tmp_path / "out").status == 0
+    store, dataset = zarr.open(tmp_path / "out" / "trajectories.zarr", mode="r"), mpmcli.dataset.open(path)
+    assert store.metadata.zarr_format == 3 and store.metadata.consolidated_metadata
+    assert sorted(store) == [f"{number:06d}" for number in dataset.numbers]
+    metadata = json.loads((tmp_path / "out" / "metadata.json").read_text())
+    assert dict(store.attrs).items() <= metadata.items() and store.attrs["dt"] == pytest.approx(PAUSE)
+    for name, group in store.groups():
+        source = dataset[int(name)]
+        for array in ("position", "velocity", "pressure", "deformation_gradient", "body", "material"):
+            np.testing.assert_array_equal(group[array][:], source.read(array))
+            assert group[array].dtype == source.read(array).dtype
+        for array, known in (("time", source.times), ("step", source.steps), ("frame", source.frames)):
+            np.testing.assert_array_equal(group[array][:], known)
+        assert (group.attrs["number"], group.attrs["split"]) == (source.number, source.split)
+        assert all(group.attrs[key] == metadata[key][name] for key in ("laws", "bodies", "colliders", "draws"))
+    assert store["000000/position"].chunks == (2, 30, 2) and store["000001/velocity"].chunks == (2, 24, 2)
 
 
 GNS = """

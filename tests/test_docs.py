@@ -236,7 +236,7 @@ def test_three_lines_of_h5py_read_a_result(commands, checkout, monkeypatch):
 
 def test_the_table_of_formats_is_that_of_the_help():
     rows = [f"| `{name}` | {what} |" for name, (_, what) in FORMATS.items()]
-    assert "\n".join(["| --- | --- |", *rows, ""]) in PAGES["docs/datasets.md"]
+    assert "\n".join(["| --- | --- |", *rows, ""]) in PAGES["docs/exports.md"]
 
 
 def test_the_table_of_the_ledger_is_complete():

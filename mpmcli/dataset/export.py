@@ -58,7 +58,7 @@ class ExportSettings:
 
 @dataclass(frozen=True)
 class ExportSummary:
-    """Summary of an export: trajectories by split, largest numbers of frames and particles, total bytes, and notes."""
+    """Summary of an export: files and stores, trajectories by split, largest numbers of frames and particles, bytes."""
 
     directory: str
     form: str
@@ -136,17 +136,17 @@ def export(
             more, notes = form.write(temporary, lambda: watch(next(count)))
             text = json.dumps(finite_json(metadata | more), indent=2, allow_nan=False) + "\n"
             (temporary / METADATA).write_text(text, encoding="utf-8", newline="\n")
-            sums = {path.name: path_digest(path) for path in temporary.iterdir()}
+            sums = {name: path_digest(path) for name, path in _files(temporary).items()}
             (temporary / SUMS).write_text(sums_text(sums), encoding="ascii", newline="\n")
-            files = {path.name: path.stat().st_size for path in sorted(temporary.iterdir())}
+            total = sum(path.stat().st_size for path in _files(temporary).values())
+            files = sorted(path.name for path in temporary.iterdir())
     except (OSError, RuntimeError) as error:
         reason = getattr(error, "strerror", None) or error
         raise RunError(f"{directory} could not be written ({reason}); nothing of it was left.") from error
     splits = {split: metadata[f"num_trajs_{split}"] for split in SPLITS}
     frames, particles = max(each.frame_count for each in chosen), metadata["num_particles_max"]
-    total = sum(files.values())
     notes = [f"The dataset is not complete: {lack}."] * bool(lack) + notes
-    return ExportSummary(str(directory), settings.form, list(files), splits, frames, particles, total, notes)
+    return ExportSummary(str(directory), settings.form, files, splits, frames, particles, total, notes)
 
 
 def check_export_directory(directory: Path, overwrite: bool) -> None:
@@ -191,7 +191,7 @@ def new_directory(directory: Path, overwrite: bool) -> Iterator[Path]:
             reason = error.strerror or error
             raise InputError(f"{directory} cannot be made ({reason}): give another place with -o.") from error
         yield temporary
-        for path in temporary.iterdir():
+        for path in _files(temporary).values():
             sync_file(path)
         if target.exists():
             # Files may have appeared in it meanwhile.
@@ -211,6 +211,11 @@ def new_directory(directory: Path, overwrite: bool) -> Iterator[Path]:
             with suppress(OSError):
                 parent.rmdir()
         raise
+
+
+def _files(directory: Path) -> dict[str, Path]:
+    """Return all files below a directory, by their path in it."""
+    return {path.relative_to(directory).as_posix(): path for path in directory.rglob("*") if path.is_file()}
 
 
 def is_export(path: Path) -> bool:

@@ -84,7 +84,7 @@ _FILE_END = "\nmpmcli crc32 {:08x}\n"
 _BLOCK = 2**22
 SUMS = "checksums.sha256"
 # Files written by mpmcli have plain names.
-_SUMS_LINE = re.compile(r"([0-9a-f]{64})  (\w[\w.-]*)\n")
+_SUMS_LINE = re.compile(r"([0-9a-f]{64})  (\w[\w.-]*(?:/\w[\w.-]*)*)\n")
 Gap = tuple[int, int]
 
 

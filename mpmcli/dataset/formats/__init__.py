@@ -6,12 +6,13 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from mpmcli.dataset.formats.format import Format
 
-# Name for --to; module and class; files and their readers, for --help and docs/datasets.md, which load no modules.
+# Name for --to; module and class; files and their readers, for --help and docs/exports.md, which load no modules.
 FORMATS = {
     "lagrangebench": ("lagrangebench.LagrangeBench", "train.h5, valid.h5, test.h5 for LagrangeBench"),
     "gns": ("gns.Gns", "train.npz, valid.npz, test.npz for GNS"),
     "npz": ("npz.Npz", "a file of plain arrays per trajectory, for NumPy"),
     "parquet": ("parquet.Parquet", "a table per split and README.md, for load_dataset of Hugging Face"),
+    "zarr": ("zarr.Zarr", "a store of Zarr 3, a group per trajectory, chunked by frames"),
     "vtkhdf": ("vtk.Vtkhdf", "a result per trajectory, for ParaView and every command of mpmcli"),
     "vtk": ("vtk.Vtk", "a .vtu per frame and a .pvd, for ParaView before 5.12"),
 }

@@ -1,0 +1,51 @@
+"""A store of Zarr 3: a group per trajectory."""
+
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+from mpmcli.dataset.formats.arrays import ArraysFormat, ExportedArray, arrays_of, facts_of
+from mpmcli.dataset.metadata import common_facts
+from mpmcli.dataset.shard import group_name
+from mpmcli.plain_json import finite_json
+
+# Bytes of a chunk, which holds at least one frame.
+CHUNK_BYTES = 4 * 2**20
+
+
+class Zarr(ArraysFormat):
+    """The store trajectories.zarr, with consolidated metadata, and the facts of metadata.json as attributes.
+
+    The group of a trajectory has its arrays, in chunks of consecutive frames with all particles, uncompressed.
+    """
+
+    files = r"trajectories\.zarr"
+    package = extra = "zarr"
+
+    def write_arrays(self, directory: Path, tick: Callable[[], None]) -> None:
+        import zarr
+
+        root = zarr.open_group(directory / "trajectories.zarr", mode="w", zarr_format=3)
+        root.attrs.update(finite_json(common_facts(self.trajectories, self.trajectories[0].stride)))
+        for each in self.trajectories:
+            facts = {"number": each.source.number, "split": each.source.split, **facts_of(each)}
+            group = root.create_group(group_name(each.source.number), attributes=facts)
+            for name, array in arrays_of(each).items():
+                options = {"shape": array.shape, "dtype": array.dtype, "chunks": _chunk(array)}
+                stored, first = group.create_array(name, compressors=None, **options), 0
+                for block in array.blocks():
+                    stored[first : first + len(block)] = block
+                    first += len(block)
+            tick()
+        with warnings.catch_warnings():
+            # Other readers of Zarr 3 may not know consolidated metadata, and need none.
+            warnings.simplefilter("ignore")
+            zarr.consolidate_metadata(root.store)
+
+
+def _chunk(array: ExportedArray) -> tuple[int, ...]:
+    frames, *rest = array.shape
+    row = array.dtype.itemsize
+    for length in rest:
+        row *= length
+    return (max(1, min(frames, CHUNK_BYTES // max(row, 1))), *rest)
