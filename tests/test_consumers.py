@@ -124,6 +124,37 @@ def test_zarr_opens_a_group_for_each_trajectory(tmp_path: Path, dtype: type, mon
     assert store["000000/position"].chunks == (2, 30, 2) and store["000001/velocity"].chunks == (2, 24, 2)
 
 
+WEBDATASET = """
+import json, sys
+from webdataset import WebDataset
+found = {}
+for sample in WebDataset(sys.argv[1], shardshuffle=False).decode():
+    arrays = {name: [array.dtype.str, array.tolist()] for name, array in sample["npz"].items()}
+    found[sample["__key__"]] = {"arrays": arrays, "facts": sample["json"]}
+print(json.dumps(found))
+"""
+
+
+def test_webdataset_reads_its_shards(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two shards of a split, as its pattern of braces names them: arrays to the bit, and facts."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("mpmcli.dataset.formats.arrays.FILE_BYTES", 1)
+    dataset = mpmcli.dataset.open(made_dataset(tmp_path / "set"))
+    assert run_here("export", dataset.path, "--to", "webdataset", "-o", tmp_path / "out").status == 0
+    shards = "train-{00000..00001}-of-00002.tar"
+    found = told(environment("webdataset"), WEBDATASET, tmp_path / "out" / shards)
+    assert sorted(found) == [f"{number:06d}" for number in dataset.splits["train"]]
+    for name, sample in found.items():
+        source = dataset[int(name)]
+        for array in ("position", "velocity", "pressure", "deformation_gradient", "body"):
+            dtype, values = sample["arrays"][array]
+            assert dtype == source.read(array).dtype.str
+            np.testing.assert_array_equal(np.array(values, dtype), source.read(array))
+        assert sample["arrays"]["time"][1] == source.times.tolist()
+        known = {"number": source.number, "split": "train", "draws": source.draws, "laws": ["fluid", "sand"]}
+        assert known.items() <= sample["facts"].items()
+
+
 GNS = """
 import json, sys
 from types import SimpleNamespace as Name

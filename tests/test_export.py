@@ -1,10 +1,12 @@
 """Exports are read by readers written from the descriptions of the formats, which know nothing of mpmcli."""
 
+import io
 import json
 import os
 import pickletools
 import shutil
 import sys
+import tarfile
 import tomllib
 import zipfile
 from collections import namedtuple
@@ -13,9 +15,11 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import h5py
+import meshio
 import numpy as np
 import pytest
 import pyvista
+import trimesh
 from command import ROOT, run_here
 from made_dataset import COUNTS, PAUSE, SPLITS, made_dataset, made_header, made_trajectory, write_dataset
 from made_result import write_made
@@ -397,6 +401,32 @@ def test_a_vtu_of_each_frame_is_what_vtk_reads(tmp_path, dimension):
         assert points["id"].tolist() == list(range(len(frame.position)))
 
 
+@pytest.mark.parametrize(("dimension", "dtype"), [(2, np.float32), (3, np.float64)])
+def test_a_ply_of_each_frame_is_what_others_read(tmp_path, dimension, dtype):
+    """Positions by VTK, in single precision, and trimesh; every property, in its type, by meshio."""
+    path = made_dataset(tmp_path / "set", dimension=dimension, dtype=dtype)
+    exported(path, "ply", tmp_path / "out", "--trajectory", 0, "--stride", 2)
+    source = mpmcli.dataset.open(path)[0]
+    assert sorted(p.name for p in (tmp_path / "out").glob("*.ply")) == [f"000000_{k:06d}.ply" for k in range(0, 11, 2)]
+    for k in range(0, FRAMES, 2):
+        file = tmp_path / "out" / f"000000_{k:06d}.ply"
+        position = np.zeros((30, 3), dtype)
+        position[:, :dimension] = source.position[k]
+        np.testing.assert_array_equal(pyvista.read(file).points, position.astype(np.float32))
+        np.testing.assert_array_equal(trimesh.load(file).vertices, position)
+        read = meshio.read(file)
+        np.testing.assert_array_equal(read.points, position)
+        known = {"id": np.arange(30), "body": source.body, "material": source.material}
+        for name, expected in {**known, "pressure": source.field("pressure")[k]}.items():
+            np.testing.assert_array_equal(read.point_data[name], expected)
+        for axis, name in enumerate(("vx", "vy", "vz")[:dimension]):
+            np.testing.assert_array_equal(read.point_data[name], source.velocity[k, :, axis])
+            assert read.point_data[name].dtype == dtype
+        gradient = np.stack([read.point_data[f"deformation_gradient_{n}"] for n in range(9)], axis=1).reshape(30, 3, 3)
+        np.testing.assert_array_equal(gradient[:, :dimension, :dimension], source.field("deformation_gradient")[k])
+        assert f"\ncomment time {float(source.times[k])!r} s\n".encode() in file.read_bytes()
+
+
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_vtkhdf_of_a_dataset_opens_as_a_result(tmp_path, dimension):
     path = made_dataset(tmp_path / "set", dimension=dimension)
@@ -491,8 +521,11 @@ def test_fewer_particles_are_the_same_ones_in_every_format_and_frame(tmp_path, f
         found = np.array(table["position"][0].as_py(), np.float32)
     elif form == "zarr":
         found = pytest.importorskip("zarr").open(tmp_path / "out" / "trajectories.zarr")["000000/position"][:]
-    elif form == "vtk":
-        files = sorted((tmp_path / "out").glob("000000_*.vtu"))
+    elif form == "webdataset":
+        with tarfile.open(tmp_path / "out" / "train-00000-of-00001.tar") as archive:
+            found = np.load(io.BytesIO(archive.extractfile("000000.npz").read()))["position"]
+    elif form in ("vtk", "ply"):
+        files = sorted((tmp_path / "out").glob("000000_*.vtu" if form == "vtk" else "000000_*.ply"))
         found = np.stack([pyvista.read(file).points[:, :2] for file in files])
     else:
         found = np.stack([f.position for f in open_result(tmp_path / "out" / "000000.vtkhdf").frames()])

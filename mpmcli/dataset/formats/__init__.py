@@ -13,8 +13,10 @@ FORMATS = {
     "npz": ("npz.Npz", "a file of plain arrays per trajectory, for NumPy"),
     "parquet": ("parquet.Parquet", "a table per split and README.md, for load_dataset of Hugging Face"),
     "zarr": ("zarr.Zarr", "a store of Zarr 3, a group per trajectory, chunked by frames"),
+    "webdataset": ("webdataset.Webdataset", "archives of .npz and .json per split, for WebDataset"),
     "vtkhdf": ("vtk.Vtkhdf", "a result per trajectory, for ParaView and every command of mpmcli"),
     "vtk": ("vtk.Vtk", "a .vtu per frame and a .pvd, for ParaView before 5.12"),
+    "ply": ("ply.Ply", "a file of points per frame, for Blender, Houdini, trimesh and VTK"),
 }
 
 

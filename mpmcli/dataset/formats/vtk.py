@@ -1,6 +1,6 @@
 """Files of VTK, for ParaView and all commands of mpmcli: temporal VTKHDF, and a series of .vtu."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -60,6 +60,19 @@ def _fixed(trajectory: SubsampledTrajectory) -> dict[str, np.ndarray]:
     return {name: trajectory.label(name) for name in LABELS} | {"id": ids}
 
 
+def stored_frames(trajectory: SubsampledTrajectory) -> Iterator[tuple[float, int, dict[str, np.ndarray]]]:
+    """Yield time (s), number and arrays of each frame, padded to 3D as in files for VTK."""
+    layouts, fixed = trajectory.layout.arrays, _fixed(trajectory)
+    streams = {
+        name: (frame for block in trajectory.blocks("position" if name == POSITION else name) for frame in block)
+        for name in layouts
+        if name not in fixed
+    }
+    for time, number in zip(trajectory.times.tolist(), trajectory.frames.tolist(), strict=True):
+        own = fixed | {name: next(stream) for name, stream in streams.items()}
+        yield time, number, {name: layout.pad(own[name]) for name, layout in layouts.items()}
+
+
 class Vtk(Vtkhdf):
     """A .vtu file for each frame and a .pvd that lists those of a trajectory, for ParaView before 5.12."""
 
@@ -70,17 +83,10 @@ class Vtk(Vtkhdf):
 
     def write(self, directory: Path, tick: Callable[[], None]) -> Written:
         for each in self.trajectories:
-            name, arrays, fixed = group_name(each.source.number), each.layout.arrays, _fixed(each)
-            streams = {
-                array: (frame for block in each.blocks("position" if array == POSITION else array) for frame in block)
-                for array in arrays
-                if array not in fixed
-            }
-            times = zip(each.times.tolist(), each.frames, strict=True)
-            listed = [(time, 0, f"{name}_{frame:06d}.vtu") for time, frame in times]
-            for *_, file in listed:
-                own = fixed | {array: next(stream) for array, stream in streams.items()}
-                write_vtu(directory / file, {array: layout.pad(own[array]) for array, layout in arrays.items()})
+            name, listed = group_name(each.source.number), []
+            for time, frame, arrays in stored_frames(each):
+                listed.append((time, 0, f"{name}_{frame:06d}.vtu"))
+                write_vtu(directory / listed[-1][2], arrays)
             (directory / f"{name}.pvd").write_text(pvd_text(listed), encoding="utf-8", newline="\n")
             tick()
         return {}, []
