@@ -22,7 +22,7 @@ MODULES = {
     "moving walls": {"boundaries.walls.MovingFaces"},
     "periodic faces": {"solver.grid.period.Period"},
     "shifts": {"solver.transfer.redistribution"},
-    "bodies that separate": {"solver.contact.body_contact", "solver.contact.surfaces"},
+    "bodies that separate": {f"solver.contact.{name}" for name in ("body_contact", "shared_field", "surfaces")},
     # Not asked for by the scene with features either.
     "grids of distances": {"boundaries.distances.GridDistance"},
     "means of volume": {f"solver.transfer.volume.{name}" for name in ("cell_of", "average_range", "average_for_frame")},

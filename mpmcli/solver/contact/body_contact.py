@@ -13,7 +13,6 @@ from collections.abc import MutableMapping, Sequence
 
 import numpy as np
 
-from mpmcli.boundaries.colliders import DEEP
 from mpmcli.boundaries.feature import Feature, Phase
 from mpmcli.boundaries.loads import Loads
 from mpmcli.boundaries.rows import Rows
@@ -21,10 +20,10 @@ from mpmcli.materials.elementary import exp, log
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
 from mpmcli.scene.sampling import lattice_spacing
-from mpmcli.solver.contact.collider_points import EMPTY, FREE, FULL, LEAST, smooth
 from mpmcli.solver.contact.contact_phases import contact_phases, obstacles_of
-from mpmcli.solver.contact.layers import Layers
-from mpmcli.solver.contact.surfaces import FAR, REACH, BodySurfaces, place_of
+from mpmcli.solver.contact.layers import AREA, DENSITY, FLAT, FRICTION, MODULUS, SHARPNESS, Layers
+from mpmcli.solver.contact.shared_field import on_face, stopped
+from mpmcli.solver.contact.surfaces import ALIKE, FAR, REACH, SMALLEST, BodySurfaces, place_of
 from mpmcli.solver.grid.grid import Grid
 from mpmcli.solver.particles.arrays import ParticleArrays
 from mpmcli.solver.particles.sort import TileOrder, stay_rolled
@@ -35,9 +34,8 @@ from mpmcli.solver.transfer.splines import PAD, bounded
 BALL = 3.0
 # Sharpness of the soft minimum of distances, per particle spacing.
 SHARP = 12.0
-# Sharpness of the mean normal of the faces that face another body. Bodies whose normals have a product above ALIKE face
-# the same direction and not each other.
-FACING, ALIKE = 16.0, 0.7
+# Sharpness of the mean normal of the faces that face another body.
+FACING = 16.0
 # Product of the normals of the faces of two bodies above which they are parallel.
 SAME = 0.999
 # Product of the normals of an obstacle near a node, and this far along it, cells, above which it is plane there. Points
@@ -56,8 +54,8 @@ STOPS = (0.1, 0.2)
 LIGHT = 0.1
 # Reach of the distance from an obstacle of points near a node, cells.
 FAR_ASIDE = 3.0
-# Largest exponent in single precision, and a number that replaces 0 in divisors and logarithms.
-LARGEST, SMALLEST = 80.0, 1e-37
+# Largest exponent in single precision.
+LARGEST = 80.0
 # Products of the normals of a point and, opposite, of the body that it meets, up to which it does not count and from
 # which it counts in full: what slides past an edge meets its side with 0. Least product of the normals of faces that
 # meet.
@@ -67,10 +65,6 @@ APART = 9.0
 # Number of GPU threads for the nodes of all runs, limited because each needs memory for surface points, and smallest
 # number per run.
 GPU_THREADS, LEAST_THREADS = 4096, 64
-# Numbers of a layer: P-wave modulus, Pa, sharpness, 1/m, normalisation of the sum over a flat surface, density, kg/m^3,
-# area of a surface point, m^(d-1), and from FRICTION on the coefficient of friction with each layer, `STICKS` for
-# sticking.
-MODULUS, SHARPNESS, FLAT, DENSITY, AREA, FRICTION = range(6)
 # Entries of `LedgerRow`, see `BodyContact.extremes`.
 EXTREMES = ("contact_overlap", "contact_gap")
 # The entry of `LedgerRow` in `BodyContact.loads`.
@@ -85,7 +79,7 @@ class BodyContact(Feature):
         surfaces: surfaces of the bodies.
         layers: number of layers per run.
         capacity: largest number of surface points of a body near a node.
-        rows: numbers of each layer of each run, see MODULUS.
+        rows: numbers of each layer of each run, see `layers.MODULUS`.
         threads: threads of a run on a GPU.
         loads: loads on the first layer of each pair by the second, about the lower corner, see `Layers.pairs`; the
             first number of one more row is the work of all contact on what it parts since the last frame, J.
@@ -181,44 +175,9 @@ class BodyContact(Feature):
             self.extremes[run, k] = 0.0
 
     @ti.func
-    def exchange_rows(
-        self,
-        grid: ti.template(),
-        obstacles: ti.template(),
-        w: int,
-        thread: int,
-        first: int,
-        after: int,
-        dt: float,
-        gravity_step: ti.template(),
-    ):
-        """Exchange momentum between bodies, then with obstacles, at rows `first` to `after` - 1 of the contact box.
-
-        `dt` is the step, s; `gravity_step` is the change of velocity by gravity in the step, m/s.
-        """
-        last = ti.static(self.dimension - 1)
-        for row in range(first, after):
-            node = grid.row_start(row)
-            index = grid.linear_index(node)
-            for _ in range(grid.row_length(node)):
-                self.exchange_all(grid, obstacles, w, thread, node, index, dt, gravity_step)
-                node[last] += 1
-                index += 1
-
-    @ti.func
-    def exchange_all(
-        self,
-        grid: ti.template(),
-        obstacles: ti.template(),
-        w: int,
-        thread: int,
-        node: ti.template(),
-        index: int,
-        dt: float,
-        gravity_step: ti.template(),
-    ):
-        """Exchange momentum between bodies, and then with obstacles, at a node with this index in layer 0."""
-        place = self.surfaces.place_of(grid, w, index)
+    def exchange_all(self, at: ti.template()):
+        """Exchange momentum between bodies, and then with obstacles, at a node; `at` is a `ContactNode`."""
+        place = self.surfaces.place_of(at.grid, at.w, at.index)
         present = self.surfaces.present[place]
         # Layers in descending order: first all pairs of layers, then each layer with the obstacles, numbered after the
         # layers.
@@ -226,38 +185,27 @@ class BodyContact(Feature):
             rest = present
             while rest > 255 or (turn == 1 and rest > ti.static(int(self.surfaces.shares))):
                 c, others, o = ti.cast(rest & 255, int) - 1, rest >> 8, 0
-                while (turn == 0 and others > 0) or (turn == 1 and o < obstacles.count()):
+                while (turn == 0 and others > 0) or (turn == 1 and o < at.obstacles.count()):
                     a = ti.select(turn == 0, ti.cast(others & 255, int) - 1, c)
                     met = ti.select(turn == 0, c, self.layers + o)
-                    self.exchange(grid, obstacles, w, thread, node, index, a, met, dt, gravity_step)
+                    self.exchange(at, a, met)
                     others, o = others >> 8, o + 1
                 rest = rest >> 8
 
     @ti.func
-    def exchange(
-        self,
-        grid: ti.template(),
-        obstacles: ti.template(),
-        w: int,
-        thread: int,
-        node: ti.template(),
-        index: int,
-        a: int,
-        c: int,
-        dt: float,
-        gravity_step: ti.template(),
-    ):
-        """Exchange momentum of layer a with layer c, or obstacle c - layers, at a node with this index in layer 0."""
-        h, d, row = ti.static((grid.spacing, self.dimension, w * self.layers))
-        at_a, at_c = index + a * ti.static(self.node_count), index + c * ti.static(self.node_count)
-        of_a = self.surfaces.total(grid, node, index, a * ti.static(self.node_count))
+    def exchange(self, at: ti.template(), a: int, c: int):
+        """Exchange momentum of layer a with layer c, or obstacle c - layers, at a node."""
+        grid, obstacles, h, d = ti.static((at.grid, at.obstacles, at.grid.spacing, self.dimension))
+        w, node, row = ti.static((at.w, at.node, at.w * self.layers))
+        at_a, at_c = at.index + a * ti.static(self.node_count), at.index + c * ti.static(self.node_count)
+        of_a = self.surfaces.total(grid, node, at.index, a * ti.static(self.node_count))
         m_a, bodies, way = of_a[d], c < self.layers, FAR
         reduced, friction = m_a, 0.0
         # The sum of the inverse moduli of both.
         soft = 1.0 / self.rows[row + a, MODULUS]
         u, J, facing = ti.Vector.zero(float, d), ti.Vector.zero(float, d), ti.Vector.zero(float, d)
         if bodies:
-            of_c = self.surfaces.total(grid, node, index, c * ti.static(self.node_count))
+            of_c = self.surfaces.total(grid, node, at.index, c * ti.static(self.node_count))
             m_c = of_c[d]
             # Evaluated in this order, because the product of two masses may be too small for single precision.
             reduced, friction = m_a * (m_c / (m_a + m_c)), self.rows[row + a, FRICTION + c]
@@ -270,24 +218,23 @@ class BodyContact(Feature):
                 way, friction = distance, rough
                 for b in ti.static(range(d)):
                     facing[b] = normal[b]
-                    u[b] = velocity[b] - gravity_step[b] - of_a[b] / m_a
+                    u[b] = velocity[b] - at.gravity_step[b] - of_a[b] / m_a
         if friction < 0.0:
             for b in ti.static(range(d)):
                 J[b] = -reduced * u[b]
         elif bodies and a < ti.static(int(self.surfaces.shares)):
-            change = self.stopped(grid, obstacles, w, thread, node, index, c, u, friction)
+            change = stopped(self, at, c, u, friction)
             for b in ti.static(range(d)):
                 J[b] = reduced * change[b]
             self.loads.add(w, node, ti.static(self.pairs), 0, reduced * change.dot(u + change))
         elif bodies or way < REACH * h:
-            gap, n, aside, kappa, deepest = self.separation(
-                grid, obstacles, w, thread, node, index, a, c, way, facing, reduced, 2.0 / soft * dt**2
-            )
+            stiffness = 2.0 / soft * at.step.dt**2
+            gap, n, aside, kappa, deepest = self.separation(at, a, c, way, facing, reduced, stiffness)
             if kappa >= 0.0:
                 spring, implicit = gap / h, IMPLICIT_OBSTACLES
                 if bodies:
                     spring, implicit = ti.max(spring, -DEEPEST), IMPLICIT
-                pushed = self.impulse(gap / h, spring, u, n, aside, kappa, implicit, reduced, h / dt, friction)
+                pushed = self.impulse(gap / h, spring, u, n, aside, kappa, implicit, reduced, h / at.step.dt, friction)
                 for b in ti.static(range(d)):
                     J[b] = pushed[b]
                 self.loads.add(w, node, ti.static(self.pairs), 0, pushed.dot(u + pushed / reduced))
@@ -305,87 +252,6 @@ class BodyContact(Feature):
                 self.loads.take(w, node, ti.raw_div(c * (c - 1), 2) + a, -J, place_of(node, h))
             elif ti.static(obstacles.any):
                 obstacles.take(c - self.layers, node, place_of(node, h), J)
-
-    @ti.func
-    def stopped(
-        self,
-        grid: ti.template(),
-        obstacles: ti.template(),
-        w: int,
-        thread: int,
-        node: ti.template(),
-        index: int,
-        c: int,
-        u: ti.template(),
-        friction: float,
-    ):
-        """Return the change of the velocity u of body c relative to the shared field at a node, m/s.
-
-        A share of their approach ends, which depends on how far the kernel of the nearest point of the surface is
-        filled outside of the body. Deeper than DEEP all of u ends, and as far outside nothing.
-        """
-        h, d, row = ti.static((grid.spacing, self.dimension, w * self.layers + c))
-        change = -u
-        _n_a, n, counts, _slopes = self.collect(grid, obstacles, w, thread, node, index, 0, c)
-        if counts[1] > 0:
-            # Points of the second body have the opposite sign.
-            first, beta = (2 * thread + 1) * self.share, self.rows[row, SHARPNESS]
-            total = self.sum_points(first, counts[1], -n, beta, ti.static(0.5 / BALL) * grid.inverse_spacing)
-            far = -log(ti.max(total * self.rows[row, FLAT], SMALLEST)) / beta
-            share, approach = 1.0, ti.max(u.dot(n), 0.0)
-            if far > -DEEP * h:
-                # Light nodes would follow the field, which crushes the outermost particles of the body.
-                share = 0.0
-            elif approach > 0.0 and far > DEEP * h:
-                filled = self.share_filled(grid, obstacles.walls, w, c, place_of(node, h) - far * n)
-                share = smooth((filled - EMPTY) / (FULL - EMPTY))
-            along = u - u.dot(n) * n
-            rub = ti.min(friction * approach, along.norm()) / ti.max(along.norm(), SMALLEST)
-            for b in ti.static(range(d)):
-                change[b] = -share * (approach * n[b] + rub * along[b])
-        return change
-
-    @ti.func
-    def share_filled(self, grid: ti.template(), walls: ti.template(), w: int, c: int, y: ti.template()):
-        """Return the share of the kernel of a point outside of body c that the shared field fills."""
-        h, d, nodes = ti.static((grid.spacing, self.dimension, grid.scheme.spline.nodes))
-        base, _ = grid.scheme.spline.stencil(y, grid.inverse_spacing)
-        full, filled = 0.0, 0.0
-        for q in range(ti.static(2 * nodes**d)):
-            node, weight, rest = base, 1.0, q
-            for b in ti.static(range(d)):
-                after = ti.raw_div(rest, nodes)
-                # The place of a point is uncertain where normals differ, but no node is off the grid.
-                node[b] = ti.min(ti.max(base[b] + rest - after * nodes, 0), ti.static(grid.shape[b] - 1))
-                rest = after
-                weight *= grid.scheme.spline.at(ti.cast(node[b] - PAD, float) - y[b] * grid.inverse_spacing)
-            mass, free = self.room_at(grid, walls, w, c, node)
-            if q < ti.static(nodes**d):
-                full = ti.max(full, ti.select(free > FREE, mass / ti.max(free, FREE), 0.0))
-            elif full > 0.0:
-                most = ti.min(full, self.rows[w * self.layers, DENSITY] * h**d)
-                filled += weight * ti.min(mass / (most * ti.max(free, LEAST)), 1.0)
-        return filled
-
-    @ti.func
-    def room_at(self, grid: ti.template(), walls: ti.template(), w: int, c: int, node: ti.template()):
-        """Return the mass of the shared field at a node, kg, and the share of the kernel inside walls outside of c."""
-        h, d, layer = ti.static((grid.spacing, self.dimension, w * self.layers + c))
-        place, free, used = node, 1.0, True
-        for a in ti.static(range(d)):
-            if ti.static(a in grid.period.axes):
-                cells = grid.period.cells[w][a]
-                place[a] += ti.select(node[a] < PAD, cells, ti.select(node[a] < PAD + cells, 0, -cells))
-            else:
-                for beyond in ti.static((node[a] - walls.first, walls.last[a] - node[a])):
-                    free *= grid.scheme.spline.share_below(ti.cast(beyond, float))
-            beyond = place[a] - self.surfaces.used[2 * layer, a]
-            used = used and beyond >= 0 and beyond < self.surfaces.used[2 * layer + 1, a]
-        index = grid.linear_index(place)
-        if used:
-            mass = self.surfaces.total(grid, place, index, c * ti.static(self.node_count))[d]
-            free -= mass / (self.rows[layer, DENSITY] * h**d)
-        return self.surfaces.total(grid, place, index, 0)[d], free
 
     @ti.func
     def impulse(
@@ -428,12 +294,7 @@ class BodyContact(Feature):
     @ti.func
     def separation(
         self,
-        grid: ti.template(),
-        obstacles: ti.template(),
-        w: int,
-        thread: int,
-        node: ti.template(),
-        index: int,
+        at: ti.template(),
         a: int,
         c: int,
         way: float,
@@ -444,6 +305,7 @@ class BodyContact(Feature):
         """Return the gap between layers a and c at a node, and the geometry of the contact.
 
         Args:
+            at: a `ContactNode`.
             a: layer of a body.
             c: layer of another body, or the number of layers plus the number of an obstacle.
             way, facing: distance of the node from the obstacle, m, and its normal there.
@@ -457,14 +319,13 @@ class BodyContact(Feature):
             kappa: k dt^2 / m of the spring at the node, -1 without contact.
             deepest: the deepest overlap, m; negative at nodes that do not represent a surface.
         """
-        h, d, row = ti.static((grid.spacing, self.dimension, w * self.layers))
+        h, d, row = ti.static((at.grid.spacing, self.dimension, at.w * self.layers))
         gap, normal, far, kappa, deepest = 0.0, ti.Vector.zero(float, d), ti.Vector.zero(float, 2), -1.0, 0.0
-        n_a, n_c, counts, slopes = self.collect(grid, obstacles, w, thread, node, index, a, c)
-        if ti.static(obstacles.any):
+        n_a, n_c, counts, slopes = self.collect(at, a, c)
+        if ti.static(at.obstacles.any):
             if c >= self.layers:
-                gap, area, off, axis, most = self.springs(
-                    obstacles, thread, counts[0], c - self.layers, place_of(node, h), row + a, way, facing
-                )
+                o = c - self.layers
+                gap, area, off, axis, most = self.springs(at, counts[0], o, row + a, way, facing)
                 if counts[0] == 0 and way <= 0.0:
                     # Material without a surface, because it was torn or crushed, is stopped behind an obstacle.
                     gap, axis, kappa = -h, -facing, 0.0
@@ -476,9 +337,9 @@ class BodyContact(Feature):
             # The faces of the bodies that look at each other. Mean normals tilt beside edges.
             faces, alike, middle = ti.Matrix.zero(float, 2, d), 0.0, 0.0
             for side in range(2):
-                stay_rolled(self.points, thread + side)
+                stay_rolled(self.points, at.thread + side)
                 towards = ti.select(side == 0, -n_c, n_a)
-                met = self.normal_along((2 * thread + side) * self.share, counts[side], towards)
+                met = self.normal_along((2 * at.thread + side) * self.share, counts[side], towards)
                 for b in ti.static(range(d)):
                     faces[side, b] = met[b]
                     alike += faces[0, b] * faces[1, b]
@@ -486,7 +347,7 @@ class BodyContact(Feature):
                 normal[b] = faces[0, b] + faces[1, b]
             normal, meet = normal.normalized(SMALLEST), alike > MEET
             if alike < SAME:
-                found, axis, off = self.between(thread, counts, row + a, row + c)
+                found, axis, off = self.between(at.thread, counts, row + a, row + c)
                 # Without any point that faces the other body the axis is zero: faces that hardly look at each other.
                 if axis.norm_sqr() > 0.5:
                     gap, middle, meet, kappa = found, off, False, 1.0
@@ -494,12 +355,8 @@ class BodyContact(Feature):
                         normal[b] = axis[b]
             if meet:
                 for side in range(2):
-                    stay_rolled(self.points, thread + side)
-                    layer = row + ti.select(side == 0, a, c)
-                    first, beta = (2 * thread + side) * self.share, self.rows[layer, SHARPNESS]
-                    inverse_width = ti.static(0.5 / BALL) * grid.inverse_spacing
-                    total = self.sum_points(first, counts[side], normal, beta, inverse_width)
-                    far[side] = -log(ti.max(total * self.rows[layer, FLAT], SMALLEST)) / beta
+                    stay_rolled(self.points, at.thread + side)
+                    far[side] = self.distance_along(at, side, counts[side], row + ti.select(side == 0, a, c), normal)
                 gap, middle, kappa = far[0] + far[1], 0.5 * (far[0] - far[1]), 1.0
             if kappa > 0.0:
                 far[0], far[1] = 0.5 * gap + middle, 0.5 * gap - middle
@@ -507,9 +364,9 @@ class BodyContact(Feature):
                 light = 0.0
                 for side in range(2):
                     density = self.rows[row + ti.select(side == 0, a, c), DENSITY]
-                    light += 1.0 / (density * filled(far[side] * grid.inverse_spacing))
+                    light += 1.0 / (density * filled(far[side] * at.grid.inverse_spacing))
                 mass = ti.max(reduced, h**d / light)
-                kappa = stiffness * h ** ti.static(d - 2) * traction(middle * grid.inverse_spacing) / mass
+                kappa = stiffness * h ** ti.static(d - 2) * traction(middle * at.grid.inverse_spacing) / mass
                 # Nodes with very little mass, beside edges, do not represent a surface.
                 deepest = ti.select(reduced > LIGHT * mass, -gap, 0.0)
         # Change of velocity from the node to the surface of each body, along its normal.
@@ -519,28 +376,18 @@ class BodyContact(Feature):
         return gap, normal, aside, kappa, deepest
 
     @ti.func
-    def springs(
-        self,
-        obstacles: ti.template(),
-        thread: int,
-        count: int,
-        o: int,
-        x: ti.template(),
-        row: int,
-        way_there: float,
-        facing_there: ti.template(),
-    ):
-        """Return the share of a node at x in the springs of the points of a body that are inside an obstacle.
+    def springs(self, at: ti.template(), count: int, o: int, row: int, way_there: float, facing_there: ti.template()):
+        """Return the share of a node in the springs of the points of a body that are inside obstacle o.
 
         Returns:
             gap: minus their mean overlap, m.
             area: sum of their areas, m^(d-1).
-            far: distance of x from the surface of the body along the axis, m.
+            far: distance of the node from the surface of the body along the axis, m.
             axis: mean normal of the obstacle at these points, from the body to the obstacle.
             deepest: overlap of the deepest of them, m.
         """
-        d = ti.static(self.dimension)
-        h, first, area, deepest, weights = obstacles.spacing, 2 * thread * self.share, 0.0, 0.0, 0.0
+        obstacles, h, d = ti.static((at.obstacles, at.grid.spacing, self.dimension))
+        x, first, area, deepest, weights = place_of(at.node, h), 2 * at.thread * self.share, 0.0, 0.0, 0.0
         force, mean = ti.Vector.zero(float, d), ti.Vector.zero(float, d)
         # Whether the obstacle is plane here, which saves most evaluations of its distance.
         plane, place = True, ti.Vector.zero(float, d)
@@ -628,7 +475,7 @@ class BodyContact(Feature):
                 along, facing = way.dot(face), 0.0
                 for b in ti.static(range(d)):
                     facing += face[b] * self.points[own + k + ti.static(d + 1 + b) * self.capacity]
-                # The ball of the point, as in `sum_points`.
+                # The ball of the point, as in `distance_along`.
                 aside = self.points[own + k + d * self.capacity] * (1.0 - along**2 / ti.max(size, SMALLEST))
                 counted = ti.min(ti.max((facing - FACES[0]) / (FACES[1] - FACES[0]), 0.0), 1.0)
                 share = counted * exp(ti.min(ti.max(-beta * (distance + aside), -LARGEST), LARGEST))
@@ -649,28 +496,18 @@ class BodyContact(Feature):
         return gap, axis, middle
 
     @ti.func
-    def collect(
-        self,
-        grid: ti.template(),
-        obstacles: ti.template(),
-        w: int,
-        thread: int,
-        node: ti.template(),
-        index: int,
-        a: int,
-        c: int,
-    ):
+    def collect(self, at: ti.template(), a: int, c: int):
         """Store the surface points of layers a and c near a node.
 
         Return their outward normals, the numbers of points, and dv/dn of both, a row each, 1/s.
         """
-        h, d = ti.static((grid.spacing, self.dimension))
+        grid, h, d = ti.static((at.grid, at.grid.spacing, self.dimension))
         n_a, n_c, counts = ti.Vector.zero(float, d), ti.Vector.zero(float, d), ti.Vector.zero(int, 2)
         slopes, weights = ti.Matrix.zero(float, 2, d), ti.Vector.zero(float, 2)
         for images in range(ti.static(grid.period.sets)):
-            there, exists = grid.period.image_from_inside(node, images)
+            there, exists = grid.period.image_from_inside(at.node, images)
             if exists:
-                place = self.surfaces.place_of(grid, w, grid.linear_index(there))
+                place = self.surfaces.place_of(grid, at.w, grid.linear_index(there))
                 for q in range(ti.static(grid.scheme.spline.nodes**d)):
                     before, inside = self.surfaces.stencil_before(grid, there, q)
                     if inside:
@@ -680,7 +517,7 @@ class BodyContact(Feature):
                                 layer = self.surfaces.shown[g][p]
                                 side = ti.select(layer == a, 0, ti.select(layer == c, 1, -1))
                                 if ti.static(self.surfaces.shares):
-                                    if a == 0 and self.on_face(grid, obstacles.walls, g, p):
+                                    if a == 0 and on_face(self.surfaces, at, g, p):
                                         side = -1
                                 if side >= 0:
                                     outwards = ti.select(side == 0, 1.0, -1.0)
@@ -698,7 +535,7 @@ class BodyContact(Feature):
                                         slopes[side, b] += weight * self.surfaces.surface[g][p][d + 1 + b]
                                     depth = self.surfaces.surface[g][p][d]
                                     if counts[side] < self.capacity:
-                                        at = (2 * thread + side) * self.share + counts[side]
+                                        slot = (2 * at.thread + side) * self.share + counts[side]
                                         if c >= self.layers:
                                             # The point moves with v + C (y - x), C = D^-1 sum w_i v_i (x_i - x)^T.
                                             lever = depth * way.dot(n) * grid.inverse_spacing**2
@@ -706,10 +543,10 @@ class BodyContact(Feature):
                                         for b in ti.static(range(d)):
                                             # Entry by entry, because Taichi may lose vectors assigned as a whole.
                                             way[b] -= depth * n[b]
-                                            self.points[at + b * self.capacity] = outwards * way[b]
-                                            self.points[at + ti.static(d + 1 + b) * self.capacity] = outwards * n[b]
-                                        self.points[at + d * self.capacity] = way.norm_sqr() / (2.0 * BALL * h)
-                                        self.points[at + ti.static(2 * d + 1) * self.capacity] = weight
+                                            self.points[slot + b * self.capacity] = outwards * way[b]
+                                            self.points[slot + ti.static(d + 1 + b) * self.capacity] = outwards * n[b]
+                                        self.points[slot + d * self.capacity] = way.norm_sqr() / (2.0 * BALL * h)
+                                        self.points[slot + ti.static(2 * d + 1) * self.capacity] = weight
                                         counts[side] += 1
                                 p = self.surfaces.following[g][p]
         for side, b in ti.static(ti.ndrange(2, d)):
@@ -717,21 +554,11 @@ class BodyContact(Feature):
         return n_a.normalized(SMALLEST), n_c.normalized(SMALLEST), counts, slopes
 
     @ti.func
-    def on_face(self, grid: ti.template(), walls: ti.template(), g: ti.template(), p: int):
-        """Return whether the surface point of a particle is on a face of the domain, where only bodies can meet it."""
-        h, d = ti.static((grid.spacing, self.dimension))
-        result = False
-        for a in ti.static(range(d)):
-            n = self.surfaces.surface[g][p][a]
-            y = self.surfaces.groups[g].x[p][a] + self.surfaces.surface[g][p][d] * n
-            last = ti.cast(walls.last[a] - walls.first, float) * h
-            result = result or (ti.abs(n) > ALIKE and ti.min(y, last - y) < 0.25 * h)
-        return result
-
-    @ti.func
-    def sum_points(self, first: int, count: int, axis: ti.template(), beta: float, inverse_width: float):
-        """Return the sum of exponentials of distances of a node from surface points along an outward axis."""
+    def distance_along(self, at: ti.template(), side: int, count: int, row: int, axis: ti.template()):
+        """Return the distance of a node from the surface of a body along an outward axis, m."""
         d = ti.static(self.dimension)
+        first, beta = (2 * at.thread + side) * self.share, self.rows[row, SHARPNESS]
+        inverse_width = ti.static(0.5 / BALL) * at.grid.inverse_spacing
         total, begin = 0.0, 0
         while begin < count:
             points, found = zero_lanes(ti.static(d + 1)), ti.Vector.zero(float, LANES)
@@ -745,7 +572,7 @@ class BodyContact(Feature):
             for lane in range(ti.min(LANES, count - begin)):
                 total += found[lane]
             begin += LANES
-        return total
+        return -log(ti.max(total * self.rows[row, FLAT], SMALLEST)) / beta
 
     @ti.func
     def normal_along(self, first: int, count: int, axis: ti.template()):

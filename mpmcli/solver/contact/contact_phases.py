@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from mpmcli.boundaries.feature import Phase
 from mpmcli.quick_taichi import ti
 from mpmcli.solver.contact.surfaces import Obstacles
+from mpmcli.solver.grid.grid import Grid
 from mpmcli.solver.particles.arrays import ParticleArrays
 
 PUSH = "let bodies push each other"
@@ -33,6 +34,23 @@ def contact_phases(groups: Sequence[ParticleArrays], *, serial: bool) -> tuple[P
 def obstacles_of(view: object) -> Obstacles:
     """Return the walls and colliders of a run."""
     return Obstacles(view.nodes.images.walls, view.nodes.colliders, view.grid.spacing)
+
+
+class ContactNode:
+    """A node of a run where bodies may be in contact with each other or with obstacles.
+
+    Attributes:
+        grid, obstacles, step, w: grid restricted to such nodes, walls and colliders, step, and index of the run.
+        gravity_step: change of velocity by gravity in the step, m/s.
+        thread: index of the thread of the batch, see `BodyContact.points`.
+        node, index: the node, and its index in layer 0; variables of a kernel that may change.
+    """
+
+    def __init__(
+        self, at: object, grid: Grid, gravity_step: object, thread: object, node: object, index: object
+    ) -> None:
+        self.grid, self.obstacles, self.step, self.w = grid, obstacles_of(at), at.step, at.w
+        self.gravity_step, self.thread, self.node, self.index = gravity_step, thread, node, index
 
 
 @ti.func
@@ -139,21 +157,28 @@ def at_bins(phases: ti.template(), at: ti.template(), do: ti.template()):
 def exchange_part(phases: ti.template(), at: ti.template()):
     """Exchange momentum between bodies in contact at nodes, and with walls and colliders."""
     (grid,) = ti.static(near_bodies(phases, at))
-    (obstacles,) = ti.static((obstacles_of(at),))
-    gravity_step = phases.gravity_of(at.step)
+    gravity_step, last = phases.gravity_of(at.step), ti.static(phases.dimension - 1)
     first, after = rows_near_bodies(phases, grid, at)
     thread = at.w * ti.static(phases.regions) + at.t
-    phases.device.features.contact.exchange_rows(grid, obstacles, at.w, thread, first, after, at.step.dt, gravity_step)
+    for row in range(first, after):
+        node = grid.row_start(row)
+        index = grid.linear_index(node)
+        (here,) = ti.static((ContactNode(at, grid, gravity_step, thread, node, index),))
+        for _ in range(grid.row_length(node)):
+            phases.device.features.contact.exchange_all(here)
+            node[last] += 1
+            index += 1
 
 
 @ti.func
 def exchange_item(phases: ti.template(), at: ti.template()):
     """Exchange momentum between bodies at some nodes, and with walls and colliders."""
     (grid,) = ti.static(near_bodies(phases, at))
-    obstacles, contact = ti.static((obstacles_of(at), phases.device.features.contact))
-    gravity_step, q = phases.gravity_of(at.step), at.q
+    (contact,) = ti.static((phases.device.features.contact,))
+    gravity_step, q, thread = phases.gravity_of(at.step), at.q, at.w * contact.threads + at.q
     while q < grid.box_nodes():
         node = grid.box_node(q)
-        index, thread = grid.linear_index(node), at.w * contact.threads + at.q
-        contact.exchange_all(grid, obstacles, at.w, thread, node, index, at.step.dt, gravity_step)
+        index = grid.linear_index(node)
+        (here,) = ti.static((ContactNode(at, grid, gravity_step, thread, node, index),))
+        contact.exchange_all(here)
         q += contact.threads

@@ -27,6 +27,10 @@ from mpmcli.solver.transfer.splines import PAD
 REACH = 1.5
 # Distance of an obstacle that is absent or does not act, m; and a node index beyond any grid.
 FAR, ALL_NODES = 1e30, 2**20
+# Product of two normals, or of a normal and an axis, above which they have the same direction.
+ALIKE = 0.7
+# A number that replaces 0 in divisors and logarithms.
+SMALLEST = 1e-37
 
 
 @ti.data_oriented
