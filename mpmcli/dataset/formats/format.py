@@ -2,12 +2,11 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, ClassVar
 
 from mpmcli.dataset.subsample import SubsampledTrajectory
-from mpmcli.errors import InputError
+from mpmcli.extras import imported
 
 # Entries of a format in metadata.json, and notes for the user.
 Written = tuple[dict[str, Any], list[str]]
@@ -30,9 +29,8 @@ class Format(ABC):
 
         `features` are the material parameters that GNS gets, None for those that differ.
         """
-        if self.package and find_spec(self.package) is None:
-            name = type(self).__name__.lower()
-            raise InputError(f'--to {name} needs {self.package}, which pip install "mpmcli[{self.extra}]" installs.')
+        if self.package and self.extra:
+            imported(self.package, self.extra, f"--to {type(self).__name__.lower()}")
         self.trajectories, self._features = trajectories, features
 
     def check(self) -> None:  # noqa: B027
