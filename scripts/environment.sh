@@ -1,5 +1,5 @@
-# Sourced by demo, test and gpu: makes .venv in this checkout, once, and installs the package into it.
-# Defines `require_libraries PACKAGE...` and `prepare_environment EXTRA`, EXTRA being "" or an extra of pyproject.toml.
+# Sourced by demo, test, gpu and consumers: makes .venv in this checkout, once, and installs the package into it.
+# Defines `require_libraries PACKAGE...` and `prepare_environment EXTRAS`, which are extras of pyproject.toml or "".
 
 find_python() {
     local name
@@ -80,7 +80,7 @@ prepare_environment() {
     stamp=$(installation_stamp)
     [ "$(cat "$stamp_file" 2>/dev/null)" = "$stamp" ] && return 0
     # The test extra has all that the package alone needs.
-    [ "$extra" != test ] && [ "$(cat .venv/installed-test 2>/dev/null)" = "$stamp" ] && return 0
+    [ -z "$extra" ] && [ "$(cat .venv/installed-test 2>/dev/null)" = "$stamp" ] && return 0
     echo "Installing mpmcli and its dependencies into .venv. The first time takes a minute or two." >&2
     if ! .venv/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e "$target" >&2; then
         echo "Installing failed, see pip's message above; nothing outside .venv was changed." >&2

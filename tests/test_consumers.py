@@ -1,7 +1,8 @@
-"""Programs of others read what mpmcli writes: Hugging Face's datasets, GNS's loader, ParaView's pvpython.
+"""Programs of others read what mpmcli writes: Hugging Face's datasets, WebDataset, Zarr, GNS's loader, pvpython.
 
-MPMCLI_CONSUMERS names a directory of environments: `datasets` with that package; `gns` with numpy and GNS's
-data_loader.py, which takes from torch its base class alone. pvpython is the one on the path. What is absent is skipped.
+MPMCLI_CONSUMERS names a directory of environments, as scripts/consumers makes them: `datasets` and `webdataset` with
+those packages; `gns` with numpy and GNS's data_loader.py, which takes from torch its base class alone. pvpython is the
+one on the path. What is absent is skipped.
 """
 
 import json
