@@ -28,6 +28,7 @@ from test_dataset_statistics import agree, plain
 import mpmcli.dataset
 from mpmcli.dataset.folder import MANIFEST, Manifest, Row
 from mpmcli.dataset.formats import FORMATS, format_named
+from mpmcli.dataset.shard import TrajectoryData
 from mpmcli.dataset.subsample import chosen_particles, joined_row
 from mpmcli.materials.registry import laws as registered
 from mpmcli.materials.registry import parameter_models
@@ -536,13 +537,19 @@ def test_fewer_particles_are_the_same_ones_in_every_format_and_frame(tmp_path, f
     assert metadata["dx"] == pytest.approx(0.025 * (36 / 24) ** 0.5)
 
 
-def test_statistics_are_of_active_particles(tmp_path):
-    """A third waits up to frame 4, and a third is gone from frame 8 on; at --stride 2 too."""
+def coming_and_going(tmp_path: Path) -> tuple[Path, TrajectoryData, np.ndarray]:
+    """Return a dataset whose particles wait up to frame 4, a third, or are gone from frame 8 on; and its status."""
     made = made_trajectory(0, particles=30)
     status = np.ones((FRAMES, 30), np.int8)
     status[:5, :10], status[8:, 10:20] = 0, 2
     made.header["scene"] = made.header["scene"].replace("walls = {  }", 'walls = { default = "slip", x_max = "open" }')
-    path = write_dataset(tmp_path / "set", [replace(made, fields=made.fields | {"status": status})])
+    made = replace(made, fields=made.fields | {"status": status})
+    return write_dataset(tmp_path / "set", [made]), made, status
+
+
+def test_statistics_are_of_active_particles(tmp_path):
+    """At --stride 2 too."""
+    path, made, status = coming_and_going(tmp_path)
     for stride in (1, 2):
         exported(path, "npz", tmp_path / "out", "--stride", stride, "--overwrite")
         there = np.where(status[::stride, :, None] == 1, made.position[::stride].astype(float), np.nan)
@@ -551,6 +558,47 @@ def test_statistics_are_of_active_particles(tmp_path):
         for name, values in {"vel": v, "acc": np.diff(v, axis=0)}.items():
             assert found[f"{name}_mean"] == pytest.approx(np.nanmean(values, axis=(0, 1)), rel=1e-9)
             assert found[f"{name}_std"] == pytest.approx(np.nanstd(values, axis=(0, 1)), rel=1e-9)
+
+
+@pytest.mark.parametrize(("stride", "frames"), [(1, slice(None)), (5, slice(None, None, 5))])
+def test_particles_that_are_always_there_go_to_every_learner(tmp_path, stride, frames):
+    """GNS and LagrangeBench refuse the others, and name the option."""
+    (path, made, status), out = coming_and_going(tmp_path), tmp_path / "out"
+    for form in ("gns", "lagrangebench"):
+        assert "--present always takes those" in refused(path, form, tmp_path / "out")
+    there = np.flatnonzero((status[frames] == 1).all(axis=0))
+    assert 0 < len(there) < 30
+    told = exported(path, "gns", tmp_path / "out", "--present", "always", "--stride", stride)
+    assert f"{30 - len(there)} particles that are not there in all frames are left out." in told["notes"]
+    entry = np.load(tmp_path / "out" / "train.npz", allow_pickle=True)["trajectory_000000"]
+    np.testing.assert_array_equal(entry[0], made.position[frames][:, there].astype(np.float32))
+    exported(path, "npz", out, "--present", "always", "--stride", stride, "--max-particles", 6, "--overwrite")
+    with np.load(out / "000000.npz") as file:
+        assert (file["status"] == 1).all() and file["position"].shape[1] == 6
+        assert set(file["position"][0, :, 0]) <= set(made.position[0, there, 0])
+
+
+def test_points_of_ply_are_those_that_are_there(tmp_path):
+    path, made, status = coming_and_going(tmp_path)
+    exported(path, "ply", tmp_path / "out")
+    for k in (0, 6, 9):
+        cloud = pyvista.read(tmp_path / "out" / f"000000_{k:06d}.ply")
+        np.testing.assert_array_equal(cloud.points[:, :2], made.position[k, status[k] == 1].astype(np.float32))
+
+
+def test_every_format_tells_the_same_facts_of_each_trajectory(tmp_path):
+    """The effective scene, the draws, and the names to which numbers refer."""
+    path, told = made_dataset(tmp_path / "set"), {}
+    for form in ("gns", "npz", "vtkhdf"):
+        exported(path, form, tmp_path / "out", "--overwrite")
+        found = metadata_of(tmp_path / "out")
+        told[form] = {key: found[key] for key in ("laws", "bodies", "colliders", "draws", "scene")}
+    assert told["gns"] == told["npz"] == told["vtkhdf"]
+    source, name = mpmcli.dataset.open(path)[2], "000002"
+    assert told["npz"]["draws"][name] == source.draws
+    assert told["npz"]["scene"][name] == tomllib.loads(source.header.stored["scene"])
+    bodies = told["npz"]["scene"][name]["bodies"]
+    assert [one["name"] for one in bodies] == told["npz"]["bodies"][name] == ["pool", "heap"]
 
 
 @pytest.mark.parametrize("form", FORMS)

@@ -181,6 +181,12 @@ def merge(parts: tuple[Path, ...], output: Path, as_json: bool) -> None:
     help="Keep at most M particles of each trajectory, the same ones in all frames: of each body its share, at random.",
 )
 @options.choice_option(
+    "--present",
+    ["any", "always"],
+    "any",
+    "always: where particles come or go, only those that are there in all exported frames.",
+)
+@options.choice_option(
     "--walls",
     ["none", "colliders", "all"],
     "none",

@@ -9,14 +9,14 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from mpmcli.dataset.dataset import Dataset
 from mpmcli.dataset.folder import MANIFEST
 from mpmcli.dataset.formats import FORMATS, format_named
 from mpmcli.dataset.metadata import EXPORTED_BY, common_facts
 from mpmcli.dataset.report import status_of
-from mpmcli.dataset.shard import SPLITS
+from mpmcli.dataset.shard import SPLITS, group_name
 from mpmcli.dataset.subsample import SEED, SubsampledTrajectory, Walls
 from mpmcli.errors import InputError, RunError
 from mpmcli.output import check_directory
@@ -41,6 +41,7 @@ class ExportSettings:
         max_particles: largest number of material particles per trajectory; None for all.
         overwrite: whether an earlier export in `directory` is replaced.
         walls: walls that get particles.
+        present: "always": only particles that are there in all exported frames.
         features: material parameters that particles of a GNS export have; None for the one that differs.
         wall_spacing: distance between neighbouring wall particles, m; None for that of the material at the start.
     """
@@ -54,6 +55,7 @@ class ExportSettings:
     walls: Walls = "none"
     wall_spacing: float | None = None
     features: tuple[str, ...] | None = None
+    present: Literal["any", "always"] = "any"
 
 
 @dataclass(frozen=True)
@@ -97,10 +99,14 @@ def export(
     check_export_directory(directory, settings.overwrite)
     numbers: Sequence[int] = dataset.numbers if settings.trajectory is None else [settings.trajectory]
     options = (settings.stride, settings.max_particles, settings.walls, settings.wall_spacing)
-    chosen = [SubsampledTrajectory(dataset[number], *options) for number in numbers]
+    always = settings.present == "always"
+    chosen = [SubsampledTrajectory(dataset[number], *options, always=always) for number in numbers]
     for each in chosen:
         if each.particle_count == 0 or each.frame_count == 0:
-            raise InputError(f"trajectory {each.source.number} of {dataset.path} is empty: there is nothing to export.")
+            lacks = (
+                "has no particle that is there in all frames" if always and each.source.particle_count else "is empty"
+            )
+            raise InputError(f"trajectory {each.source.number} of {dataset.path} {lacks}: there is nothing to export.")
     metadata = common_facts(chosen, settings.stride)
     lack = ""
     if settings.trajectory is None and (dataset.path / MANIFEST).exists():
@@ -112,6 +118,7 @@ def export(
                 "its sweep was interrupted, or a file is missing; --trajectory N exports one that is there."
             )
         lack, told = status.lack(), status.as_dict()
+        metadata["verdict"] = {group_name(row.number): row.verdict for row in status.rows if row.number in {*numbers}}
         metadata["dataset"] = {name: told[name] for name in ("part", "trajectories", "done", "accepted", "verdicts")}
     if any(each.particle_count < each.source.particle_count for each in chosen):
         metadata["particle_seed"] = SEED
@@ -145,6 +152,8 @@ def export(
         raise RunError(f"{directory} could not be written ({reason}); nothing of it was left.") from error
     splits = {split: metadata[f"num_trajs_{split}"] for split in SPLITS}
     frames, particles = max(each.frame_count for each in chosen), metadata["num_particles_max"]
+    gone = sum(each.source.particle_count for each in chosen) - sum(each.there_count for each in chosen)
+    notes += [f"{counted(gone, 'particle')} that are not there in all frames are left out."] * bool(gone)
     notes = [f"The dataset is not complete: {lack}."] * bool(lack) + notes
     return ExportSummary(str(directory), settings.form, files, splits, frames, particles, total, notes)
 

@@ -1,5 +1,6 @@
 """The contents of metadata.json in all formats of an export, with the statistics of motion for training code."""
 
+import tomllib
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -7,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from mpmcli import __version__
-from mpmcli.dataset.shard import SPLITS
+from mpmcli.dataset.shard import SPLITS, group_name
 from mpmcli.dataset.subsample import SubsampledTrajectory
 from mpmcli.errors import InputError
 from mpmcli.frames.frame import ACTIVE, STATUS
@@ -17,7 +18,7 @@ from mpmcli.output.header import RunHeader, nearest_image
 # ones at 2 (2D) and sqrt(3) (3D). LagrangeBench takes about the same (1.45, data_gen/.../gen_dataset.py).
 RADIUS_IN_SPACINGS = 1.5
 EXPORTED_BY = "exported_by"
-FORMAT_KEY, FORMAT = "export_format", 2
+FORMAT_KEY, FORMAT = "export_format", 3
 # Tolerance as a fraction of the time between frames: steps end at frames exactly, up to the rounding of sums.
 UNEVEN = 1e-6
 LEAST_FRAMES = 3
@@ -43,6 +44,7 @@ def common_facts(trajectories: Sequence[SubsampledTrajectory], stride: int) -> d
     numbers = {split: [e.source.number for e in trajectories if e.source.split == split] for split in SPLITS}
     lengths = {each.frame_count for each in trajectories}
     pauses = [time_between(each) for each in trajectories]
+    known = {group_name(each.source.number): facts_of(each) for each in trajectories}
     same = all(pause is not None and abs(pause - pauses[0]) <= UNEVEN * pause for pause in pauses)
     return {
         EXPORTED_BY: f"mpmcli {__version__}",
@@ -64,6 +66,23 @@ def common_facts(trajectories: Sequence[SubsampledTrajectory], stride: int) -> d
         "num_frames": lengths.pop() if len(lengths) == 1 else None,
         **{f"num_trajs_{split}": len(numbers[split]) for split in SPLITS},
         "trajectories": numbers,
+        **{key: {name: facts[key] for name, facts in known.items()} for key in facts_of(trajectories[0])},
+    }
+
+
+def facts_of(trajectory: SubsampledTrajectory) -> dict[str, Any]:
+    """Return the names of laws, bodies and colliders, to which numbers in arrays refer, the draws, and the scene.
+
+    The scene is the effective one, as `tomllib` reads it, in SI units: materials, gravity and drives as numbers or
+    expressions of the time, impulses, motions of colliders.
+    """
+    header = trajectory.source.header
+    return {
+        "laws": [law.name for law in header.laws],
+        "bodies": list(header.body_names),
+        "colliders": list(header.collider_names),
+        "draws": trajectory.source.draws,
+        "scene": tomllib.loads(str(header.stored.get("scene", ""))),
     }
 
 
@@ -132,10 +151,10 @@ def require_alike(trajectories: Sequence[SubsampledTrajectory], form: str) -> No
         )
     for each in trajectories:
         number, header = each.source.number, each.source.header
-        if header.comes_and_goes:
+        if header.comes_and_goes and not each.always:
             raise InputError(
-                f"trajectory {number} has particles that come or go, and {form} cannot say which are there: --to npz "
-                'and --to vtkhdf keep their field "status".'
+                f"trajectory {number} has particles that come or go, and {form} cannot say which are there: --present "
+                'always takes those that are there in all frames; npz, parquet and zarr keep the field "status" of all.'
             )
         if each.frame_count != first.frame_count:
             raise InputError(

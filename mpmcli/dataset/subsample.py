@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 
 from mpmcli.dataset.dataset import ALL, Particles, Trajectory
+from mpmcli.frames.frame import ACTIVE, STATUS
 from mpmcli.frames.ledger import LOADS, LedgerRow
 from mpmcli.output.header import RunHeader
 from mpmcli.output.layout import FrameLayout
@@ -115,12 +116,19 @@ class SubsampledTrajectory:
         most: int | None = None,
         walls: Walls = "none",
         wall_spacing: float | None = None,
+        *,
+        always: bool = False,
     ) -> None:
-        """Thin a trajectory; nothing is read. `wall_spacing` is that of the particles at the start if None."""
-        self.source = source
+        """Thin a trajectory. `wall_spacing` is that of the particles at the start if None.
+
+        With `always` only those particles are taken that are active in all its frames; else nothing is read.
+        """
+        self.source, self.always = source, always
+        self._there = _always_there(source, stride) if always and STATUS in source.field_names else None
         self.stride, self._most = stride, most
         self.times, self.steps, self.frames = (table[::stride] for table in (source.times, source.steps, source.frames))
-        self.particle_count = source.particle_count if most is None else min(source.particle_count, most)
+        self.there_count = source.particle_count if self._there is None else len(self._there)
+        self.particle_count = self.there_count if most is None else min(self.there_count, most)
         spacing = wall_spacing or self.spacing
         self.walls = WallParticles(source.header, source.colliders, walls if spacing else "none", spacing or 1.0)
 
@@ -139,7 +147,8 @@ class SubsampledTrajectory:
         """Which particles are taken: all, or ascending indices."""
         if self.particle_count == self.source.particle_count:
             return ALL
-        return chosen_particles(self.source.body, self.particle_count, self.source.number)
+        there = np.arange(self.source.particle_count) if self._there is None else self._there
+        return there[chosen_particles(self.source.body[there], self.particle_count, self.source.number)]
 
     @property
     def spacing(self) -> float | None:
@@ -148,7 +157,7 @@ class SubsampledTrajectory:
         if header.spacing is None or not header.bodies:
             return None
         fewest = min(body.particles_per_cell for body in header.bodies)
-        share = self.particle_count / max(self.source.particle_count, 1)
+        share = self.particle_count / max(self.there_count, 1)
         return header.spacing / (fewest * share) ** (1 / header.dimension)
 
     @cached_property
@@ -190,6 +199,15 @@ class SubsampledTrajectory:
             first = max(k - self.stride + 1, 0)
             found.append(joined_row(rows[first : k + 1], rows[max(first - 1, 0)].time))
         return found
+
+
+def _always_there(source: Trajectory, stride: int) -> np.ndarray:
+    """Return the ascending indices of the particles that are active in every `stride`-th frame."""
+    there = np.ones(source.particle_count, bool)
+    block = max(1, BLOCK_BYTES // max(source.particle_count, 1)) * stride
+    for first in range(0, source.frame_count, block):
+        there &= (source.read(STATUS, slice(first, first + block, stride)) == ACTIVE).all(axis=0)
+    return np.flatnonzero(there)
 
 
 def joined_row(rows: Sequence[LedgerRow], before: float) -> LedgerRow:

@@ -5,13 +5,12 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from mpmcli.dataset.formats.format import Format, Written
 from mpmcli.dataset.metadata import LEAST_FRAMES, learning_facts, outruns_periods
-from mpmcli.dataset.shard import LABELS, MOVING, SPLITS, group_name
+from mpmcli.dataset.shard import LABELS, MOVING, SPLITS
 from mpmcli.dataset.subsample import SubsampledTrajectory
 from mpmcli.frames.ledger import RIGID
 from mpmcli.output.layout import POSITION
@@ -58,17 +57,6 @@ def arrays_of(trajectory: SubsampledTrajectory) -> dict[str, ExportedArray]:
     return found | {name: ExportedArray(a.dtype, a.shape, partial(iter, [a])) for name, a in known.items()}
 
 
-def facts_of(trajectory: SubsampledTrajectory) -> dict[str, Any]:
-    """Return the names of laws, bodies and colliders, to which numbers in arrays refer, and the draws."""
-    header = trajectory.source.header
-    return {
-        "laws": [law.name for law in header.laws],
-        "bodies": list(header.body_names),
-        "colliders": list(header.collider_names),
-        "draws": trajectory.source.draws,
-    }
-
-
 class ArraysFormat(Format):
     """All arrays of each trajectory; all must have the same d."""
 
@@ -81,8 +69,6 @@ class ArraysFormat(Format):
 
     def write(self, directory: Path, tick: Callable[[], None]) -> Written:
         self.write_arrays(directory, tick)
-        known = {group_name(each.source.number): facts_of(each) for each in self.trajectories}
-        facts = {key: {name: of[key] for name, of in known.items()} for key in ("laws", "bodies", "colliders", "draws")}
         why = ""
         if min(each.frame_count for each in self.trajectories) < LEAST_FRAMES:
             why = "Some trajectories have fewer than three frames"
@@ -92,7 +78,7 @@ class ArraysFormat(Format):
             statistics, notes = ({}, []) if why else learning_facts(self.trajectories)
         except ValueError:
             why, statistics, notes = "A trajectory has no particle that is active in three frames", {}, []
-        return facts | statistics, [f"{why}: metadata.json has no statistics of motion."] if why else notes
+        return statistics, [f"{why}: metadata.json has no statistics of motion."] if why else notes
 
     @staticmethod
     def _bytes(trajectory: SubsampledTrajectory) -> int:

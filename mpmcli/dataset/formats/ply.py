@@ -11,6 +11,7 @@ import numpy as np
 from mpmcli.dataset.formats.format import Written
 from mpmcli.dataset.formats.vtk import Vtkhdf, stored_frames
 from mpmcli.dataset.shard import group_name
+from mpmcli.frames.frame import ACTIVE, STATUS
 from mpmcli.output.layout import POSITION
 
 TYPES = {"i1": "char", "u1": "uchar", "i2": "short", "u2": "ushort", "i4": "int", "u4": "uint"}
@@ -21,8 +22,8 @@ COMPONENTS = {POSITION: ("x", "y", "z"), "velocity": ("vx", "vy", "vz")}
 class Ply(Vtkhdf):
     """Binary files, little-endian, of vertices with x, y, z (0 in 2D), id, vx, vy, vz, body, material and fields.
 
-    Components of other vectors and tensors are numbered, rows first: deformation_gradient_0 to _8. Whole numbers of 64
-    bits, which PLY lacks, become doubles.
+    Particles that wait or have gone are left out. Components of other vectors and tensors are numbered, rows first:
+    deformation_gradient_0 to _8. Whole numbers of 64 bits, which PLY lacks, become doubles.
     """
 
     files = r"\d{6,}_\d{6,}\.ply"
@@ -33,6 +34,9 @@ class Ply(Vtkhdf):
     def write(self, directory: Path, tick: Callable[[], None]) -> Written:
         for each in self.trajectories:
             for time, frame, arrays in stored_frames(each):
+                if STATUS in arrays:
+                    present = arrays[STATUS] == ACTIVE
+                    arrays = {name: array[present] for name, array in arrays.items()}
                 path = directory / f"{group_name(each.source.number)}_{frame:06d}.ply"
                 path.write_bytes(ply_bytes(arrays, f"time {time!r} s"))
             tick()

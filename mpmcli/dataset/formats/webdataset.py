@@ -6,8 +6,9 @@ import tarfile
 from collections.abc import Callable
 from pathlib import Path
 
-from mpmcli.dataset.formats.arrays import ArraysFormat, arrays_of, facts_of
+from mpmcli.dataset.formats.arrays import ArraysFormat, arrays_of
 from mpmcli.dataset.formats.npz import write_npz
+from mpmcli.dataset.metadata import facts_of
 from mpmcli.dataset.shard import group_name
 
 

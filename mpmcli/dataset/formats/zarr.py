@@ -4,8 +4,8 @@ import warnings
 from collections.abc import Callable
 from pathlib import Path
 
-from mpmcli.dataset.formats.arrays import ArraysFormat, ExportedArray, arrays_of, facts_of
-from mpmcli.dataset.metadata import common_facts
+from mpmcli.dataset.formats.arrays import ArraysFormat, ExportedArray, arrays_of
+from mpmcli.dataset.metadata import common_facts, facts_of
 from mpmcli.dataset.shard import group_name
 from mpmcli.plain_json import finite_json
 
