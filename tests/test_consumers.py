@@ -125,6 +125,30 @@ def test_zarr_opens_a_group_for_each_trajectory(tmp_path: Path, dtype: type, mon
     assert store["000000/position"].chunks == (2, 30, 2) and store["000001/velocity"].chunks == (2, 24, 2)
 
 
+GRAIN = """
+import json, sys
+import grain, mpmcli.dataset
+windows = mpmcli.dataset.open(sys.argv[1]).windows("train", past=3, future=2, fields=["pressure"])
+found = grain.MapDataset.source(windows).shuffle(seed=1).to_iter_dataset().mp_prefetch(
+    grain.multiprocessing.MultiprocessingOptions(num_workers=2))
+if __name__ == "__main__":
+    print(json.dumps([{name: array.tolist() for name, array in window.items()} for window in found]))
+"""
+
+
+def test_grain_reads_windows_in_two_workers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All of them, once each."""
+    monkeypatch.chdir(tmp_path)
+    path = made_dataset(tmp_path / "set")
+    windows = mpmcli.dataset.open(path).windows("train", past=3, future=2, fields=["pressure"])
+    found = {(one["trajectory"], one["time"][0]): one for one in told(environment("grain"), GRAIN, path)}
+    assert len(found) == len(windows) > 10
+    for window in windows:
+        same = found[int(window["trajectory"]), float(window["time"][0])]
+        for name, array in window.items():
+            np.testing.assert_array_equal(np.array(same[name], array.dtype), array)
+
+
 WEBDATASET = """
 import json, sys
 from webdataset import WebDataset

@@ -26,7 +26,9 @@ class Zarr(ArraysFormat):
         import zarr
 
         root = zarr.open_group(directory / "trajectories.zarr", mode="w", zarr_format=3)
-        root.attrs.update(finite_json(common_facts(self.trajectories, self.trajectories[0].stride)))
+        common = common_facts(self.trajectories, self.trajectories[0].stride)
+        own = facts_of(self.trajectories[0])
+        root.attrs.update(finite_json({key: value for key, value in common.items() if key not in own}))
         for each in self.trajectories:
             facts = {"number": each.source.number, "split": each.source.split, **facts_of(each)}
             group = root.create_group(group_name(each.source.number), attributes=facts)
