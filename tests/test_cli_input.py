@@ -130,7 +130,7 @@ def test_a_backend_that_is_not_there_is_refused(refused, monkeypatch):
         (["simulat"], 'there is no command "simulat"; did you mean "simulate"? See mpmcli --help.'),
         (
             ["paint"],
-            'there is no command "paint"; the commands are simulate, new, check, warm, sweep, dataset, ',
+            'there is no command "paint"; the commands are new, check, simulate, materials, info, ',
         ),
         (["--verbose"], "no such option '--verbose'"),
         (["simulate"], "missing argument 'SCENE'. See mpmcli simulate --help."),

@@ -311,6 +311,14 @@ def test_the_scene_table_covers_every_config(scripts):
     assert all(section.count(f"`{name}`") == 2 for name in known)
 
 
+def test_the_gallery_is_what_the_script_writes(scripts):
+    """Of every scene, from its header and the tables of the page on scenes."""
+    gallery = scripts("picture_table").gallery()
+    assert gallery in PAGES["docs/gallery.md"]
+    for path in (ROOT / "configs").glob("*.toml"):
+        assert f"(pictures/{path.stem}.png)" in gallery and (ROOT / "docs" / "pictures" / f"{path.stem}.png").exists()
+
+
 def test_the_known_answer_of_the_drop_measures_an_error(scripts, tmp_path):
     """An exact affine motion has none; the same with one axis 1 % too long has 1 % there."""
     known = scripts("known_answers.py")
