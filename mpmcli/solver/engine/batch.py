@@ -89,9 +89,9 @@ class Batch:
         groups = [
             ParticleArrays(
                 law,
-                d,
                 runs * capacity,
                 (runs * bodies, CONSTANTS + len(law.constants(law.members[0]))),
+                kind.layers,
                 # Forces select the particles of their body.
                 many_bodies=runs > 1 or bodies > 1 or bool(forces.terms),
                 serial=on_cpu and backend.threads == 1,
@@ -101,8 +101,6 @@ class Batch:
                 levels=levels_volume(kind.settings, law),
                 has_wall_friction=slips_in(kind.settings, kind.rough),
                 comes_and_goes=kind.inflow.any,
-                layers=kind.layers.count,
-                surfaced=kind.layers.separate and law.surfaced,
             )
             for law, shares, capacity, bodies, forces in zip(
                 kind.members, averaged, kind.particles, kind.bodies, kind.drives.forces, strict=True
@@ -177,8 +175,6 @@ class Batch:
         tile = tile_edge(scheme.spline.nodes, kind.dimension, on_cpu=on_cpu)
         sparse = {"blocks": blocks, "threads": self.backend.threads} if kind.sparse and on_cpu else {}
         grid = (SparseGrid if sparse else Grid)(
-            kind.dimension,
-            1.0,
             kind.cells,
             node_width(kind.dimension, on_cpu=on_cpu),
             scheme,

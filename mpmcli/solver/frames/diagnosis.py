@@ -9,10 +9,9 @@ import numpy as np
 
 from mpmcli.errors import RunError
 from mpmcli.materials.tensors import determinant
-from mpmcli.scene import Domain, Scene
+from mpmcli.scene import Domain
 from mpmcli.solver.transfer.particle_update import SMALLEST_J
 from mpmcli.solver.transfer.splines import PAD
-from mpmcli.stability.limits import Limit
 
 
 @dataclass(frozen=True)
@@ -162,33 +161,6 @@ def cause_of(snapshot: Snapshot, p: int, dt: float, domain: Domain) -> str:
     return f"{OUTRAN} at {speed:.4g} m/s"
 
 
-def diagnose(
-    snapshot: Snapshot,
-    p: int,
-    cause: str,
-    scene: Scene,
-    step: int,
-    time: float,
-    step_size: float,
-    limit: Limit,
-    *,
-    forced: bool,
-) -> Diagnosis:
-    """Return the diagnosis for particle p (in solver order) of a group, which stopped the run with this cause."""
-    advice = next((advice for start, advice in SUGGESTIONS.items() if cause.startswith(start)), OTHERWISE)
-    return Diagnosis(
-        step,
-        time,
-        int(snapshot.id[p]),
-        scene.sources[int(snapshot.body[p])].name,
-        tuple((snapshot.x[p].astype(np.float64) + scene.domain.origin).tolist()),
-        cause,
-        limit.name,
-        step_size,
-        FORCED if forced else advice,
-    )
-
-
 def stop(run: object, dt: float) -> NoReturn:
     """Stop a `Run` at a rigid body or a lost particle, or if neither is recorded at the first unsound particle.
 
@@ -227,6 +199,11 @@ def require_sums_hold(run: object) -> None:
 
 
 def _stop_at(run: object, snapshot: Snapshot, p: int, cause: str, dt: float) -> NoReturn:
+    """Stop a run at particle p (in solver order) of a group for this cause, in a step of dt, s."""
     limit = run.nearest_limit
-    forced = run.forced and dt > limit.value
-    raise UnstableRunError(diagnose(snapshot, p, cause, run.scene, run.step_count, run.time, dt, limit, forced=forced))
+    advice = next((advice for start, advice in SUGGESTIONS.items() if cause.startswith(start)), OTHERWISE)
+    if run.forced and dt > limit.value:
+        advice = FORCED
+    name, found = run.scene.sources[int(snapshot.body[p])].name, int(snapshot.id[p])
+    place = tuple((snapshot.x[p].astype(np.float64) + run.scene.domain.origin).tolist())
+    raise UnstableRunError(Diagnosis(run.step_count, run.time, found, name, place, cause, limit.name, dt, advice))

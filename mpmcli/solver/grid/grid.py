@@ -70,7 +70,7 @@ class Grid(LinearNodes):
     The node with index n along an axis is at the distance (n - PAD) h from the lower wall.
 
     Attributes:
-        spacing: h, m.
+        spacing: h, m; 1 except in the view of a run.
         inverse_spacing: 1/h, 1/m.
         gradient_scale: h / D, the factor of a velocity gradient.
         cells: cells of the domain per axis.
@@ -110,8 +110,6 @@ class Grid(LinearNodes):
 
     def __init__(
         self,
-        dimension: int,
-        spacing: float,
         cells: tuple[int, ...],
         width: int,
         scheme: TransferScheme,
@@ -126,17 +124,16 @@ class Grid(LinearNodes):
         layers: int = 1,
     ) -> None:
         """Allocate nodes for `runs` runs; `averages` states for each group whether it averages volumes over cells."""
-        self.dimension, self.kept = dimension, width
+        self.dimension, self.kept = len(cells), width
         self.parts = (0, width) if scheme.keeps_flip_velocity else (0,)
         self.width = width * len(self.parts)
-        self.spacing, self.inverse_spacing = spacing, 1 / spacing
-        self.gradient_scale = scheme.spline.inverse_moment / spacing
+        self.spacing, self.inverse_spacing, self.gradient_scale = 1.0, 1.0, scheme.spline.inverse_moment
         self.cells, self.scheme, self.tile = tuple(cells), scheme, tile
         self.tiles = self.tile_counts(cells, tile)
         self.tile_count = math.prod(self.tiles)
         self.shape = tuple(self.tile * n for n in self.tiles)
-        self.strides = tuple(int(np.prod(self.shape[a + 1 :])) for a in range(dimension))
-        self.planes = scheme.spline.nodes if dimension == 3 else 1
+        self.strides = tuple(int(np.prod(self.shape[a + 1 :])) for a in range(len(cells)))
+        self.planes = scheme.spline.nodes if len(cells) == 3 else 1
         self.runs, self.opens, self.first_node = runs, tuple(opens), 0
         self.node_count = self.stored_nodes()
         self.layers = layers
@@ -151,7 +148,7 @@ class Grid(LinearNodes):
         self.kept_means = tuple(means for means in self.means if means is not None)
         self.period = period
         self.deterministic, self.fixed, self.fine = deterministic, None, None
-        self.box = ti.field(int, shape=(2 * runs, dimension))
+        self.box = ti.field(int, shape=(2 * runs, len(cells)))
 
     def in_layer(self, layer: object, own: object) -> "Grid":
         """Return the view of a layer, given its number and its box in use, which are variables of a kernel."""

@@ -9,6 +9,7 @@ from mpmcli.boundaries.rows import Rows
 from mpmcli.materials.elementary import exp
 from mpmcli.materials.law import Law
 from mpmcli.quick_taichi import ti
+from mpmcli.solver.contact.layers import Layers
 from mpmcli.solver.grid.period import Period
 
 # Particles per launch of a read: with up to 27 numbers each, entries stay within 32-bit indices and need half a
@@ -20,40 +21,6 @@ MOST_READ = 2**22
 MASS, VOLUME, CONSTANTS = 0, 1, 2
 # Spare numbers after the last field.
 SPARE = 16
-
-
-def particle_fields(
-    deformation: str,
-    internal: Sequence[str],
-    dimension: int,
-    precision: str,
-    *,
-    many_bodies: bool,
-    keeps_initial: bool = False,
-    uses_f_bar: bool = False,
-    levels: bool = False,
-    total: bool = False,
-    has_wall_friction: bool = False,
-    comes_and_goes: bool = False,
-    surfaced: bool = False,
-) -> dict[str, tuple[type, int, int]]:
-    """Return kind (float or int), rows and columns of each particle field by name; for options see `ParticleArrays`."""
-    d = dimension
-    fields = {"position": (float, d, 1), "velocity": (float, d, 1)}
-    # One more column in single precision, see `ParticleArrays.gradient`.
-    fields["velocity_gradient"] = (float, d, d + (precision == "f32"))
-    if deformation == "F":
-        fields["deformation_gradient"] = (float, d, d)
-    else:
-        fields["volume_ratio"] = (float, 1, 1)
-    fields |= {name: (float, 1, 1) for name in internal}
-    fields |= {"initial_position": (float, d, 1)} if keeps_initial else {}
-    fields |= {"volume_to_mean": (float, 1, 1), "cell": (int, 1, 1)} if uses_f_bar or levels else {}
-    fields |= {"volume_growth": (float, 1, 1)} if uses_f_bar and not total else {}
-    fields |= {"slip": (float, d, 1)} if has_wall_friction else {}
-    fields |= {"surface": (float, d + 1, 1)} if surfaced else {}
-    fields |= {"id": (int, 1, 1)} | ({"body": (int, 1, 1)} if many_bodies else {})
-    return fields | ({"activity": (int, 1, 1)} if comes_and_goes else {})
 
 
 def _field(count: int, kind: type, rows: int, columns: int) -> ti.Field:
@@ -117,51 +84,35 @@ class ParticleArrays:
     def __init__(
         self,
         law: Law,
-        dimension: int,
         count: int,
         table: tuple[int, int],
+        layers: Layers,
         *,
         many_bodies: bool,
         serial: bool,
-        keeps_initial: bool = False,
-        total: bool = False,
-        uses_f_bar: bool = False,
-        levels: bool = False,
-        has_wall_friction: bool = False,
-        comes_and_goes: bool = False,
-        layers: int = 1,
-        surfaced: bool = False,
+        keeps_initial: bool,
+        total: bool,
+        uses_f_bar: bool,
+        levels: bool,
+        has_wall_friction: bool,
+        comes_and_goes: bool,
     ) -> None:
         """Allocate fields for `count` particles, and a table with these numbers of rows and columns."""
-        self.law, self.capacity = law, count
-        self.dimension = d = dimension
+        self.law, self.capacity, self.dimension = law, count, law.dimension
         self.real = np.float64 if ti.lang.impl.current_cfg().default_fp == ti.f64 else np.float32
         self.carries = self.real == np.float32
         self.many_bodies, self.serial, self.total, self.uses_f_bar = many_bodies, serial, total, uses_f_bar
         self.levels, self.averages = levels, uses_f_bar or levels
         self.keeps_initial, self.evened = keeps_initial or total, uses_f_bar and not total
         self.has_wall_friction, self.comes_and_goes = has_wall_friction, comes_and_goes
-        self.layers, self.surfaced = layers, surfaced
-        wanted = particle_fields(
-            law.deformation,
-            names := [variable.name for variable in law.internal],
-            d,
-            "f32" if self.carries else "f64",
-            many_bodies=many_bodies,
-            keeps_initial=self.keeps_initial,
-            uses_f_bar=uses_f_bar,
-            levels=levels,
-            total=total,
-            has_wall_friction=has_wall_friction,
-            comes_and_goes=comes_and_goes,
-            surfaced=self.surfaced,
-        )
+        self.layers, self.surfaced = layers.count, layers.separate and law.surfaced
+        wanted = self._wanted()
         sizes = {float: np.dtype(self.real).itemsize, int: 4}
         self.bytes_by_name = {name: rows * columns * sizes[kind] for name, (kind, rows, columns) in wanted.items()}
         made = {name: _field(count, *shape) for name, shape in wanted.items()}
         self.x, self.v, self.gradient = made["position"], made["velocity"], made["velocity_gradient"]
         self.displacement_gradient, self.J_minus_1 = made.get("deformation_gradient"), made.get("volume_ratio")
-        self.internal = tuple(made[name] for name in names)
+        self.internal = tuple(made[variable.name] for variable in law.internal)
         self.initial, self.slip, self.carried = (made.get(name) for name in ("initial_position", "slip", "surface"))
         self.cell, self.to_mean, self.growth = (made.get(name) for name in ("cell", "volume_to_mean", "volume_growth"))
         self.id, self.body, self.activity = made["id"], made.get("body"), made.get("activity")
@@ -172,10 +123,29 @@ class ParticleArrays:
         self.period: Period | None = None
         self.table = ti.Vector.field(table[1], float, shape=table[0])
         self.kept = ti.field(float, shape=table[0])
-        self.layer = ti.field(int, shape=table[0]) if layers > 1 else None
-        self.rows = Rows(self.table, *([self.layer] if layers > 1 else []))
+        self.layer = ti.field(int, shape=table[0]) if self.layers > 1 else None
+        self.rows = Rows(self.table, *([self.layer] if self.layers > 1 else []))
         # Taichi stores fields one after the other, so that reads beyond the last particle fall into the next fields.
         self.spare = ti.field(float, shape=SPARE)
+
+    def _wanted(self) -> dict[str, tuple[type, int, int]]:
+        """Return kind (float or int), rows and columns of each field of particles by name."""
+        d = self.dimension
+        fields = {"position": (float, d, 1), "velocity": (float, d, 1)}
+        # One more column in single precision, see `gradient`.
+        fields["velocity_gradient"] = (float, d, d + self.carries)
+        if self.law.deformation == "F":
+            fields["deformation_gradient"] = (float, d, d)
+        else:
+            fields["volume_ratio"] = (float, 1, 1)
+        fields |= {variable.name: (float, 1, 1) for variable in self.law.internal}
+        fields |= {"initial_position": (float, d, 1)} if self.keeps_initial else {}
+        fields |= {"volume_to_mean": (float, 1, 1), "cell": (int, 1, 1)} if self.averages else {}
+        fields |= {"volume_growth": (float, 1, 1)} if self.evened else {}
+        fields |= {"slip": (float, d, 1)} if self.has_wall_friction else {}
+        fields |= {"surface": (float, d + 1, 1)} if self.surfaced else {}
+        fields |= {"id": (int, 1, 1)} | ({"body": (int, 1, 1)} if self.many_bodies else {})
+        return fields | ({"activity": (int, 1, 1)} if self.comes_and_goes else {})
 
     def push_by(self, force: object) -> None:
         self.has_body_force, self.force = True, force

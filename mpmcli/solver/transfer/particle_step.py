@@ -162,7 +162,7 @@ def hand_over(particles: ti.template(), group: ti.template(), own: ti.template()
         for i, j in ti.static(ti.ndrange(d, d)):
             C[i, j] = at_rest[i, j]
             stress[i, j] = nominal[i, j]
-    middle, change = momentum(grid, distance, own.row[MASS], own.row[VOLUME], v, C, stress, kick)
+    middle, change = momentum(grid, distance, own.row, v, C, stress, kick)
     if ti.static(grid.scheme.keeps_flip_velocity):
         kept = own.C
         if ti.static(group.total):
@@ -227,8 +227,7 @@ def take_back(
 def momentum(
     grid: ti.template(),
     distance: ti.template(),
-    mass: float,
-    volume: float,
+    row: ti.template(),
     v: ti.template(),
     C: ti.template(),
     stress: ti.template(),
@@ -236,7 +235,7 @@ def momentum(
 ):
     """Return unweighted momentum and mass at the middle node of a stencil, and their change per cell and axis."""
     d = ti.static(grid.dimension)
-    middle = ti.Vector.zero(float, grid.width)
+    mass, volume, middle = row[MASS], row[VOLUME], ti.Vector.zero(float, grid.width)
     change = ti.Matrix.zero(float, d, grid.width)
     stress_scale = kick * volume * grid.gradient_scale
     for c in ti.static(range(d)):
