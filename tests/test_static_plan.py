@@ -18,7 +18,7 @@ MODULES = {
     "colliders": {"boundaries.colliders", "boundaries.colliders.ColliderMotion", "boundaries.distances"},
     "friction": {"boundaries.mirror_images.find_friction", "boundaries.walls.RoughFaces"},
     "emitters": {"solver.particles.inflow"},
-    "forces": {"solver.drive.expressions.Application", "solver.drive.expressions.TimeTables"},
+    "forces": {"solver.drive.expressions.TimeTables", "solver.drive.forces.GroupForce"},
     "moving walls": {"boundaries.walls.MovingFaces"},
     "periodic faces": {"solver.grid.period.Period"},
     "shifts": {"solver.transfer.redistribution"},
@@ -120,7 +120,7 @@ def test_a_plain_scene_has_nothing_of_features(backend_of: Callable, given: Coun
 
 
 @pytest.mark.slow
-def test_a_scene_with_features_has_their_modules(backend_of: Callable, given: Counter) -> None:
+def test_a_scene_with_features_has_their_modules(backend_of: Callable, given: Counter, own_kernels: None) -> None:
     """So that the names above are those of what features need; grids and means stay out."""
     asked, backend = scene(with_features=True), backend_of("f32", 1)
     plan = make_plan(asked, backend)
