@@ -319,6 +319,18 @@ def test_the_gallery_is_what_the_script_writes(scripts):
         assert f"(pictures/{path.stem}.png)" in gallery and (ROOT / "docs" / "pictures" / f"{path.stem}.png").exists()
 
 
+def test_records_of_the_bench_are_told_as_ratios(scripts):
+    """Of the first record of the same machine, case and threads."""
+
+    def record(commit: str, processor: str, took: float) -> str:
+        side = {"threads": 1, "ns_per_particle_step": took}
+        case = {"case": "2d-64", "ratio": 5.0, "sides": {"mpmcli": side}}
+        return json.dumps({"commit": commit, "machine": {"processor": processor}, "arch": "cpu", "cases": [case]})
+
+    rows = scripts("records").rows([record("a", "one", 20.0), record("b", "two", 8.0), record("c", "one", 16.0)])
+    assert [(row[0], row[5]) for row in rows] == [("a", "1.000"), ("b", "1.000"), ("c", "1.250")]
+
+
 def test_the_known_answer_of_the_drop_measures_an_error(scripts, tmp_path):
     """An exact affine motion has none; the same with one axis 1 % too long has 1 % there."""
     known = scripts("known_answers.py")
