@@ -520,7 +520,7 @@ class ColliderPoints(Feature):
         return result, grip
 
     @ti.func
-    def meet(self, grid: ti.template(), node: ti.template(), rigid: ti.template()):
+    def push_rigid(self, grid: ti.template(), node: ti.template(), rigid: ti.template()):
         """Add to the sums of rigid bodies the impulses that the points of a node would give to them."""
         d = ti.static(self.dimension)
         p = self.head[self.place(grid.linear_index(node))] - 1
@@ -631,7 +631,7 @@ def weigh_points(at: ti.template(), node: ti.template(), _kick: float):
 @ti.func
 def meet_points(at: ti.template(), node: ti.template(), _kick: float):
     """Add the impulses of the points of a node to the sums of rigid bodies."""
-    at.features.points.meet(at.grid, node, at.features.rigid)
+    at.features.points.push_rigid(at.grid, node, at.features.rigid)
 
 
 @ti.func

@@ -390,7 +390,7 @@ class BodySurfaces:
                         cells = obstacles.nearest(place_of(node, grid.spacing), REACH) * grid.inverse_spacing
                         met += 2 * ti.cast(cells < REACH, int)
                         far = node[last] + ti.cast(ti.min(ti.max(cells - REACH, 0.0), 1e6), int)
-                self.meet(grid, node, place + k, met)
+                self.open_bins(grid, node, place + k, met)
                 node[last] += 1
 
     @ti.func
@@ -413,7 +413,7 @@ class BodySurfaces:
         return result
 
     @ti.func
-    def meet(self, grid: ti.template(), node: ti.template(), place: int, met: int):
+    def open_bins(self, grid: ti.template(), node: ti.template(), place: int, met: int):
         """Store `met` of a node, and open the bins of the stencils that contain it."""
         self.met[place] = met
         if met > 0:
@@ -447,7 +447,7 @@ class BodySurfaces:
         if ti.static(obstacles.any):
             if bodies > 0:
                 met += 2 * ti.cast(obstacles.nearest(place_of(node, grid.spacing), REACH) < REACH * grid.spacing, int)
-        self.meet(grid, node, place, met)
+        self.open_bins(grid, node, place, met)
 
     @ti.func
     def opens(self, g: ti.template(), grid: ti.template(), w: int, low: ti.template(), high: ti.template()):

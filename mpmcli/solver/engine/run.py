@@ -108,7 +108,7 @@ class Run:
         self.groups: list[RunGroup] = groups_of(batch, slot, scene, self._particles)
         self._budget = LaunchBudget(self.particle_count)
         self._recorder = FrameRecorder(batch, slot, self.particle_count, scene.time.frames)
-        self._place()
+        self._set_up()
         if batch.device.grid.sparse:
             places = [np.empty((0, scene.dimension)), *(body.position for body in self._particles)]
             batch.occupy(first_nodes_of(np.concatenate(places), scene))
@@ -116,7 +116,7 @@ class Run:
         _ = self._builder
         self._particles = []
 
-    def _place(self) -> None:
+    def _set_up(self) -> None:
         """Write the data of the scene, and let the next launch measure the state at time 0."""
         scene, batch, state = self.scene, self.batch, self._state
         drives = Drives.of(scene, [group.bodies for group in self.groups])[1]
@@ -264,7 +264,7 @@ class Run:
             self._recorder.index, self._recorder.steps = 1, self.step_count
             while not self.ended and self._time_of(self._recorder.index) <= self.time:
                 self._recorder.index += 1
-            self._aim()
+            self._set_target()
         if self.backend.on_cpu and not resumed:
             self._recorder.start(self._builder.columns)
             self._state.arrived = not self._begun or self.ended
@@ -293,26 +293,26 @@ class Run:
             else:
                 yield self.frame()
                 self._recorder.index = 1
-                self._aim()
+                self._set_target()
             return
         self._note_launch()
         if self._state.records:
             yield from self._recorded()
-        self._attend()
+        self._handle_status()
         if not self.backend.on_cpu and self._state.arrived:
             # A particle inverted by the last step would be detected only in the next step.
             if not self._control.sound():
                 stop(self, self.last_step)
             index, taken = self._recorder.index, steps_of(self._state, self.step_count - self._recorder.steps)
             self._recorder.index, self._recorder.steps = index + 1, self.step_count
-            self._aim()
+            self._set_target()
             yield self.frame(index, taken)
 
     def _time_of(self, index: int) -> float:
         """Return the time of a frame, s."""
         return self.scene.time.end * index / self.scene.time.frames
 
-    def _aim(self, *, anew: bool = True) -> None:
+    def _set_target(self, *, anew: bool = True) -> None:
         """Set the target to the time of the next frame, and if `anew` reset the statistics of steps."""
         state = self._state
         state.frame = min(self._recorder.index, self.scene.time.frames)
@@ -381,14 +381,14 @@ class Run:
     def restart(self) -> None:
         """Restart at time 0 with the current particles on the device, which the caller has set."""
         self._forget_lost()
-        self._place()
+        self._set_up()
         self._recorder.index, self._builder.before = 0, 0.0
         self.begin()
 
     def _start(self) -> None:
         """Set the bounds at time 0 from the measurement of the first launch."""
         self.first_step_seconds = self.batch.first_seconds
-        self._follow()
+        self._renew_control()
         self._control.begin()
         free = [each.fastest(self.scene.domain, 0.0) for each in self.scene.colliders if each.free]
         self._state.speed = max([self._control.speed, *free])
@@ -397,7 +397,7 @@ class Run:
         self._measure_forces(self.stable_step()[0])
         self._state.first_stable_step = self.stable_step()[0]
 
-    def _follow(self) -> None:
+    def _renew_control(self) -> None:
         """Create the control of the step from the last measurement of the kernel."""
         measured = [partial(self._measured, g) for g in range(len(self.groups))]
         self._control = StepControl(self.scene, self.groups, self._state, measured)
@@ -451,7 +451,7 @@ class Run:
             self.before_launch()
             self.batch.launch()
             self._note_launch()
-            self._attend()
+            self._handle_status()
 
     def measure(self) -> None:
         """Measure the state of all particles and update the limits."""
@@ -481,7 +481,7 @@ class Run:
 
     # Work of the host between launches.
 
-    def _attend(self) -> None:
+    def _handle_status(self) -> None:
         """Handle the status of the run after a launch."""
         status = self._state.status
         if status in (LOST, COLLAPSED):
@@ -548,7 +548,7 @@ class Run:
         """
         write_batch(self.batch, saved.arrays)
         self._forget_lost()
-        self._follow()
+        self._renew_control()
         self._control.load(saved.numbers["step_control"])
         self._filled_since, self._coarse = saved.numbers["tables"]
         if math.isfinite(self._filled_since):
@@ -561,7 +561,7 @@ class Run:
         elif self._resumed:
             self._recorder.start(self._builder.columns)
         if self._resumed:
-            self._aim(anew=self._state.arrived == 1 and not self.ended)
+            self._set_target(anew=self._state.arrived == 1 and not self.ended)
 
     # Lost particles.
 

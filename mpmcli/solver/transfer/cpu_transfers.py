@@ -34,7 +34,7 @@ from mpmcli.solver.transfer.lanes import (
     weights_of,
     zero_lanes,
 )
-from mpmcli.solver.transfer.particle_step import Loads, NodeSums, Receiver, Sender, hand_over, loads_on, take_back
+from mpmcli.solver.transfer.particle_step import Loads, NodeSums, Receiver, Sender, g2p, loads_on, p2g
 from mpmcli.solver.transfer.particle_update import SMALLEST_J, scatter_volume
 from mpmcli.solver.transfer.splines import bounded
 from mpmcli.solver.transfer.stencils import add_linear, gather_linear
@@ -111,7 +111,7 @@ def scatter_range(
             (loads,) = ti.static((Loads(share, lacking, push, slope, touch, friction),))
             (own,) = ti.static((Sender(place, here, v, C, state, inner, row, constants, loads),))
             base, distance = grid.scheme.spline.stencil(place, grid.inverse_spacing)
-            middle, change, plastic, inner_after = hand_over(particles, group, own, distance, kick)
+            middle, change, plastic, inner_after = p2g(particles, group, own, distance, kick)
             ratios[lane] = volume_ratio(group, state)
             if ti.static(group.law.projects):
                 set_deformation(group, deformation, deformation_of(group, deformation, lane) + plastic, lane)
@@ -272,7 +272,7 @@ def advance_range(
             old_moment = node_rows_of(moments, d, width, kept, d, lane)
             (own,) = ti.static((Receiver(place, remainder, v, C, before, constants, share, lacking),))
             (sums,) = ti.static((NodeSums(distance, velocity, moment, old_velocity, old_moment),))
-            v_after, C_after, inside, left, out, state, growth, rate, slope = take_back(
+            v_after, C_after, inside, left, out, state, growth, rate, slope = g2p(
                 particles, group, own, sums, dt, gravity_step
             )
             set_vector(speeds, 0, v_after, lane)

@@ -122,7 +122,7 @@ def loads_on(particles: ti.template(), g: ti.template(), group: ti.template(), p
 
 
 @ti.func
-def hand_over(particles: ti.template(), group: ti.template(), own: ti.template(), distance: ti.template(), kick: float):
+def p2g(particles: ti.template(), group: ti.template(), own: ti.template(), distance: ti.template(), kick: float):
     """Return the contribution of a particle, a `Sender`, to its nodes, and its plastic flow.
 
     Node i receives the momentum w_i (m v + A (x_i - x_p)), A = m C - kick V0 tau / D (Hu et al. 2018, eq. 18), and the
@@ -172,7 +172,7 @@ def hand_over(particles: ti.template(), group: ti.template(), own: ti.template()
 
 
 @ti.func
-def take_back(
+def g2p(
     particles: ti.template(),
     group: ti.template(),
     own: ti.template(),

@@ -11,7 +11,7 @@ from mpmcli.solver.grid.grid import Grid, LinearNodes
 from mpmcli.solver.grid.period import opaque
 from mpmcli.solver.particles.arrays import MASS, VOLUME
 from mpmcli.solver.particles.state_bounds import deformation_rate, volume_ratio
-from mpmcli.solver.transfer.particle_step import Loads, NodeSums, Receiver, Sender, hand_over, loads_on, take_back
+from mpmcli.solver.transfer.particle_step import Loads, NodeSums, Receiver, Sender, g2p, loads_on, p2g
 from mpmcli.solver.transfer.splines import PAD
 from mpmcli.solver.transfer.stencils import add_linear, columns, gather_linear
 from mpmcli.solver.transfer.volume import level_volume, missing_growth, relax_volume
@@ -121,7 +121,7 @@ class ParticleUpdate:
             (loads,) = ti.static((Loads(share, missing, push, slope, touch, friction),))
             (own,) = ti.static((Sender(place, here, v, C, state, inner, row, constants, loads),))
             base, distance = grid.scheme.spline.stencil(place, grid.inverse_spacing)
-            middle, change, plastic, inner_after = hand_over(self, group, own, distance, kick)
+            middle, change, plastic, inner_after = p2g(self, group, own, distance, kick)
             if ti.static(group.law.projects):
                 group.change(p, plastic, inner_after)
             w, first = grid.scheme.spline.weights(distance), grid.linear_index(base)
@@ -171,7 +171,7 @@ class ParticleUpdate:
         old_velocity, old_moment = columns(all_sums, moments, kept, d)
         (own,) = ti.static((Receiver(x, remainder, v, C, deformation, constants, share, missing),))
         (sums,) = ti.static((NodeSums(distance, velocity, moment, old_velocity, old_moment),))
-        v_after, C_after, inside, left, beyond, after, growth, rate, slope = take_back(
+        v_after, C_after, inside, left, beyond, after, growth, rate, slope = g2p(
             self, group, own, sums, dt, gravity_step
         )
         for c in ti.static(range(d)):
