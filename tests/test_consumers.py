@@ -103,9 +103,9 @@ def test_load_dataset_reads_parquet_to_the_bit(
 def test_zarr_opens_a_group_for_each_trajectory(tmp_path: Path, dtype: type, monkeypatch: pytest.MonkeyPatch) -> None:
     """Consolidated, with all arrays, in chunks of frames, and with attributes as in metadata.json."""
     zarr = pytest.importorskip("zarr")
-    # Chunks of two frames of 30 particles, written in blocks of three.
-    monkeypatch.setattr("mpmcli.dataset.formats.zarr.CHUNK_BYTES", 2 * 30 * 2 * np.dtype(dtype).itemsize)
-    monkeypatch.setattr("mpmcli.dataset.subsample.BLOCK_BYTES", 3 * 36 * 2 * np.dtype(dtype).itemsize)
+    # Two chunks of six frames of 30 particles, since 8 of 11 frames are as many as fit, written in blocks of four.
+    monkeypatch.setattr("mpmcli.dataset.formats.zarr.CHUNK_BYTES", 8 * 30 * 2 * np.dtype(dtype).itemsize)
+    monkeypatch.setattr("mpmcli.dataset.subsample.BLOCK_BYTES", 4 * 30 * 2 * np.dtype(dtype).itemsize)
     path = made_dataset(tmp_path / "set", dtype=dtype)
     assert run_here("export", path, "--to", "zarr", "-o", tmp_path / "out").status == 0
     store, dataset = zarr.open(tmp_path / "out" / "trajectories.zarr", mode="r"), mpmcli.dataset.open(path)
@@ -122,7 +122,7 @@ def test_zarr_opens_a_group_for_each_trajectory(tmp_path: Path, dtype: type, mon
             np.testing.assert_array_equal(group[array][:], known)
         assert (group.attrs["number"], group.attrs["split"]) == (source.number, source.split)
         assert all(group.attrs[key] == metadata[key][name] for key in ("laws", "bodies", "colliders", "draws"))
-    assert store["000000/position"].chunks == (2, 30, 2) and store["000001/velocity"].chunks == (2, 24, 2)
+    assert store["000000/position"].chunks == (6, 30, 2) and store["000001/deformation_gradient"].chunks[0] == 4
 
 
 GRAIN = """

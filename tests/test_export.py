@@ -470,14 +470,21 @@ def test_a_table_of_parquet_is_divided_and_has_arrays_where_shapes_agree(tmp_pat
         assert row["body"] == source[number].body[chosen].tolist() and row["time"] == source[number].times.tolist()
 
 
-def test_a_table_of_parquet_has_the_same_columns_in_all_rows(tmp_path):
-    pytest.importorskip("pyarrow")
+def test_a_column_of_parquet_has_one_type_and_null_where_an_array_is_absent(tmp_path, monkeypatch):
+    reader = pytest.importorskip("pyarrow.parquet")
     made = [made_trajectory(0), made_trajectory(1)]
     del made[1].fields["pressure"]
-    path = write_dataset(tmp_path / "set", made)
-    assert "0 and 1 differ in having the field pressure" in refused(path, "parquet", tmp_path / "out")
+    exported(write_dataset(tmp_path / "set", made), "parquet", tmp_path / "out")
+    rows = reader.read_table(tmp_path / "out" / "train-00000-of-00001.parquet").to_pylist()
+    assert rows[1]["pressure"] is None
+    np.testing.assert_array_equal(rows[0]["pressure"], made[0].fields["pressure"])
+    assert '{"name": "pressure", "list": {"list": "float32"}}' in (tmp_path / "out" / "README.md").read_text()
+    shutil.rmtree(tmp_path / "out")
     path = write_dataset(tmp_path / "other", [made_trajectory(0), made_trajectory(1, dtype=np.float64)])
     assert "position has different types" in refused(path, "parquet", tmp_path / "out")
+    monkeypatch.setattr("mpmcli.dataset.formats.parquet.LARGEST", 24 * FRAMES * 2 - 1)
+    message = refused(path, "parquet", tmp_path / "out", "--trajectory", 0)
+    assert "position of a trajectory has more than 2^31 numbers" in message and "--stride" in message
 
 
 @pytest.mark.parametrize("form", [form for form in FORMATS if format_named(form).package])

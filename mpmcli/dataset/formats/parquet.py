@@ -1,6 +1,7 @@
 """Tables of Parquet as `load_dataset` of Hugging Face reads them: a row per trajectory."""
 
 import json
+import math
 from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
@@ -11,9 +12,10 @@ import numpy as np
 from mpmcli.dataset.formats.arrays import ArraysFormat, ExportedArray, arrays_of
 from mpmcli.dataset.shard import SPLITS
 from mpmcli.errors import InputError
+from mpmcli.plain_text import one_line
 
-# Arrays of datasets have up to five axes.
-MOST_AXES = 5
+# Arrays of datasets have up to five axes, and lists as many numbers as 31 bits count.
+MOST_AXES, LARGEST = 5, 2**31 - 1
 _CARD = """\
 ---
 configs:
@@ -50,20 +52,16 @@ class Parquet(ArraysFormat):
     package, extra = "pyarrow", "huggingface"
 
     def check(self) -> None:
-        moving = {each.source.number: each.source.field_names for each in self.trajectories}
-        first = self.trajectories[0].source.number
-        for number, names in moving.items():
-            if set(names) != set(moving[first]):
-                name = min(set(names) ^ set(moving[first]))
-                raise InputError(
-                    f"trajectories {first} and {number} differ in having the field {name}: a table has the same "
-                    "columns in all rows; --to npz takes trajectories that differ."
-                )
         for name, found in self._columns.items():
             if len({(array.dtype, len(array.shape)) for array in found}) > 1:
                 raise InputError(
                     f"{name} has different types in the trajectories: a table has one type in each column; --to npz "
                     "takes trajectories that differ."
+                )
+            if any(math.prod(array.shape) > LARGEST for array in found):
+                raise InputError(
+                    f"{name} of a trajectory has more than 2^31 numbers, too many for a row of a table: take a larger "
+                    "--stride, or --max-particles."
                 )
 
     @cached_property
@@ -118,7 +116,7 @@ class Parquet(ArraysFormat):
         return _CARD.format(
             files="\n".join(f"  - split: {split}\n    path: {split}-*.parquet" for split in splits),
             features="\n".join(f"  - {json.dumps(feature)}" for feature in features),
-            title=first.source.header.title or "Trajectories of particles",
+            title=one_line(first.source.header.title or "Trajectories of particles"),
             split=splits[0],
             dimension=first.layout.dimension,
         )
@@ -130,6 +128,6 @@ def _nested(array: np.ndarray) -> Any:
 
     found = pa.array(array.reshape(-1))
     for axis in reversed(range(array.ndim)):
-        offsets = np.arange(int(np.prod(array.shape[:axis])) + 1) * array.shape[axis]
+        offsets = np.arange(math.prod(array.shape[:axis]) + 1) * array.shape[axis]
         found = pa.ListArray.from_arrays(pa.array(offsets, pa.int32()), found)
     return found

@@ -1,5 +1,6 @@
 """A store of Zarr 3: a group per trajectory."""
 
+import math
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -46,8 +47,7 @@ class Zarr(ArraysFormat):
 
 
 def _chunk(array: ExportedArray) -> tuple[int, ...]:
+    """Return the shape of chunks of nearly equal numbers of frames: Zarr pads the last one."""
     frames, *rest = array.shape
-    row = array.dtype.itemsize
-    for length in rest:
-        row *= length
-    return (max(1, min(frames, CHUNK_BYTES // max(row, 1))), *rest)
+    most = max(1, CHUNK_BYTES // (array.dtype.itemsize * math.prod(rest)))
+    return (math.ceil(frames / math.ceil(frames / most)), *rest)
