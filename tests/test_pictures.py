@@ -1,4 +1,4 @@
-"""The pictures of docs/gallery.md and the film of the README: there is one of every example scene, they are small, and the script makes them."""
+"""The pictures of the example scenes and the film of the README: small, complete, and made by the scripts."""
 
 import importlib.machinery
 import importlib.util
