@@ -142,7 +142,8 @@ def test_a_full_disk_leaves_no_half_files(whole: Path, small_disk: Callable[[int
 
 
 @pytest.mark.parametrize(
-    "form", ["vtkhdf", *(pytest.param(f, marks=pytest.mark.slow) for f in ("npz", "lagrangebench"))]
+    "form",
+    ["vtkhdf", *(pytest.param(f, marks=pytest.mark.slow) for f in ("npz", "lagrangebench", "zarr", "webdataset"))],
 )
 def test_an_export_above_the_limit_of_files_leaves_nothing(whole: Path, tmp_path: Path, form: str) -> None:
     outcome = run_limited(whole, 20_000, "export", "run", "--to", form, "-o", tmp_path / "exported")
