@@ -520,6 +520,9 @@ def test_fewer_particles_are_the_same_ones_in_every_format_and_frame(tmp_path, f
     if form == "lagrangebench":
         with h5py.File(tmp_path / "out" / "train.h5") as file:
             found = file["00000/position"][:]
+    elif form == "neuralmpm":
+        with h5py.File(tmp_path / "out" / "train" / "sim_0.h5") as file:
+            found = file["particles"][:]
     elif form == "gns":
         found = GnsReader(tmp_path / "out" / "train.npz").data[0][0]
     elif form == "npz":
@@ -567,11 +570,50 @@ def test_statistics_are_of_active_particles(tmp_path):
             assert found[f"{name}_std"] == pytest.approx(np.nanstd(values, axis=(0, 1)), rel=1e-9)
 
 
+def parsed_by_neuralmpm(path: Path, dimension: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return positions with velocities, and types, as NMPMParser of NeuralMPM makes them of a file."""
+    with h5py.File(path) as file:
+        particles, boundary = (file[name][()][..., :dimension] for name in ("particles", "boundary"))
+        types = file["types"][()] if "types" in file and len(np.unique(file["types"])) > 1 else None
+    whole = np.concatenate([boundary, particles], axis=1)
+    types = np.ones(particles.shape[1]) if types is None else types
+    if len(types) != whole.shape[1]:
+        types = np.concatenate([np.zeros(boundary.shape[1]), types])
+    return np.concatenate([whole[1:], np.diff(whole, axis=0)], axis=-1), types
+
+
+@pytest.mark.parametrize("walls", ["none", "all"])
+def test_neuralmpm_parses_each_trajectory(tmp_path, walls):
+    """In the order of the numbers of a split, with the walls as its boundary."""
+    path = made_dataset(tmp_path / "set", dimension=2)
+    exported(path, "neuralmpm", tmp_path / "out", "--walls", walls)
+    dataset, metadata = mpmcli.dataset.open(path), metadata_of(tmp_path / "out")
+    assert (metadata["num_types"], metadata["sequence_length"]) == (3, FRAMES)
+    for split, numbers in dataset.splits.items():
+        for k, number in enumerate(numbers):
+            state, types = parsed_by_neuralmpm(tmp_path / "out" / split / f"sim_{k}.h5", 2)
+            own = types > 0
+            source = dataset[number]
+            assert own.sum() == source.particle_count and (not own.all()) == (walls == "all")
+            np.testing.assert_array_equal(state[:, own, :2], source.position[1:].astype(np.float32))
+            np.testing.assert_array_equal(types[own], 1 + source.material)
+            still = state[:, ~own]
+            assert not still[..., 2:].any() and np.isin(still[..., :2], (0.0, 1.0)).any(axis=-1).all()
+
+
+def test_neuralmpm_gets_the_gravity_that_differs(tmp_path):
+    made = [made_trajectory(k) for k in range(2)]
+    made[1].header["scene"] = made[1].header["scene"].replace("gravity = [-1.0, -1.0]", "gravity = [0.0, -2.0]")
+    exported(write_dataset(tmp_path / "set", made), "neuralmpm", tmp_path / "out")
+    found = [h5py.File(tmp_path / "out" / "train" / f"sim_{k}.h5")["grav"][()].tolist() for k in range(2)]
+    assert found == [[-1.0, -1.0], [0.0, -2.0]]
+
+
 @pytest.mark.parametrize(("stride", "frames"), [(1, slice(None)), (5, slice(None, None, 5))])
 def test_particles_that_are_always_there_go_to_every_learner(tmp_path, stride, frames):
     """GNS and LagrangeBench refuse the others, and name the option."""
     (path, made, status), out = coming_and_going(tmp_path), tmp_path / "out"
-    for form in ("gns", "lagrangebench"):
+    for form in ("gns", "lagrangebench", "neuralmpm"):
         assert "--present always takes those" in refused(path, form, tmp_path / "out")
     there = np.flatnonzero((status[frames] == 1).all(axis=0))
     assert 0 < len(there) < 30
