@@ -523,6 +523,8 @@ def test_fewer_particles_are_the_same_ones_in_every_format_and_frame(tmp_path, f
     elif form == "neuralmpm":
         with h5py.File(tmp_path / "out" / "train" / "sim_0.h5") as file:
             found = file["particles"][:]
+    elif form == "tfrecord":
+        found = tfrecords(tmp_path / "out" / "train.tfrecord", 2)[0][0]
     elif form == "gns":
         found = GnsReader(tmp_path / "out" / "train.npz").data[0][0]
     elif form == "npz":
@@ -568,6 +570,34 @@ def test_statistics_are_of_active_particles(tmp_path):
         for name, values in {"vel": v, "acc": np.diff(v, axis=0)}.items():
             assert found[f"{name}_mean"] == pytest.approx(np.nanmean(values, axis=(0, 1)), rel=1e-9)
             assert found[f"{name}_std"] == pytest.approx(np.nanstd(values, axis=(0, 1)), rel=1e-9)
+
+
+def tfrecords(path: Path, dimension: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return positions (T, N, d) and types (N,) of each trajectory, as the package tfrecord reads the file."""
+    reader = pytest.importorskip("tfrecord.reader")
+    described = {"context_description": {"particle_type": "byte"}, "features_description": {"position": "byte"}}
+    loader = reader.sequence_loader(str(path), None, **described, compression_type=None)
+    found = []
+    for context, sequence in loader:
+        frames = [np.frombuffer(bytes(frame), np.float32).reshape(-1, dimension) for frame in sequence["position"]]
+        found.append((np.stack(frames), np.frombuffer(bytes(context["particle_type"]), np.int64)))
+    return found
+
+
+def test_another_package_reads_tfrecords(tmp_path):
+    """Positions and types of each trajectory of a split, and the length that the loader of DeepMind asks for."""
+    path = made_dataset(tmp_path / "set", dimension=2)
+    exported(path, "tfrecord", tmp_path / "out", "--walls", "all")
+    dataset = mpmcli.dataset.open(path)
+    assert metadata_of(tmp_path / "out")["sequence_length"] == FRAMES - 1
+    for split, numbers in dataset.splits.items():
+        found = tfrecords(tmp_path / "out" / f"{split}.tfrecord", 2)
+        assert len(found) == len(numbers)
+        for (position, kinds), number in zip(found, numbers, strict=True):
+            source, n = dataset[number], dataset[number].particle_count
+            np.testing.assert_array_equal(position[:, :n], source.position.astype(np.float32))
+            assert kinds[:n].tolist() == np.array([5, 6])[source.material].tolist() and (kinds[n:] == 3).all()
+            assert len(kinds) == position.shape[1] > n
 
 
 def parsed_by_neuralmpm(path: Path, dimension: int) -> tuple[np.ndarray, np.ndarray]:

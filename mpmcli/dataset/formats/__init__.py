@@ -10,6 +10,7 @@ if TYPE_CHECKING:
 FORMATS = {
     "lagrangebench": ("lagrangebench.LagrangeBench", "train.h5, valid.h5, test.h5 for LagrangeBench"),
     "gns": ("gns.Gns", "train.npz, valid.npz, test.npz for GNS"),
+    "tfrecord": ("tfrecord.TfRecord", "train.tfrecord, valid.tfrecord, test.tfrecord of Learning to simulate"),
     "neuralmpm": ("neuralmpm.NeuralMpm", "train/sim_0.h5 and so on for NeuralMPM"),
     "npz": ("npz.Npz", "a file of plain arrays per trajectory, for NumPy"),
     "parquet": ("parquet.Parquet", "a table per split and README.md, for load_dataset of Hugging Face"),
