@@ -119,6 +119,29 @@ def test_walls_that_cannot_be_had_are_refused(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
+def test_usd_has_particles_and_colliders_where_they_are(tmp_path: Path) -> None:
+    """The rod's corners at each frame, in metres with Y up; the stage has no fault that USD's own checker finds."""
+    usd, geom, checks = (pytest.importorskip(f"pxr.{name}") for name in ("Usd", "UsdGeom", "UsdValidation"))
+    path = run(tmp_path / "run", [POST, ROD])
+    export(path, "usd", tmp_path / "out")
+    stage = usd.Stage.Open(str(tmp_path / "out" / "000000.usdc"))
+    assert (geom.GetStageUpAxis(stage), geom.GetStageMetersPerUnit(stage)) == ("Y", 1.0)
+    faults = checks.ValidationContext(checks.ValidationRegistry().GetOrLoadAllValidators()).Validate(stage)
+    assert not [one.GetMessage() for one in faults if one.GetType() == checks.ValidationErrorType.Error]
+    points = geom.Points.Get(stage, "/World/Particles")
+    rod = geom.BasisCurves.Get(stage, "/World/rod")
+    for k in range(4):
+        code = stage.GetStartTimeCode() + k
+        found = np.array(points.GetPointsAttr().Get(code))
+        assert found[:, :2] == pytest.approx(WATER_AT + np.array([0.01 * k**2, 0.0]), abs=1e-6)
+        assert np.array_equal(points.GetIdsAttr().Get(code), np.arange(len(WATER_AT)))
+        pose = np.array(rod.ComputeLocalToWorldTransform(code))
+        placed = np.array(rod.GetPointsAttr().Get()) @ pose[:3, :3] + pose[3, :3]
+        c, s = np.cos(0.5 * k), np.sin(0.5 * k)
+        back = (placed[:, :2] - [0.3, 0.625]) @ np.array([[c, -s], [s, c]])
+        assert np.abs(back) == pytest.approx(np.tile([0.1, 0.025], (len(back), 1)), abs=1e-6)
+
+
 def test_an_npz_has_the_poses_of_moving_colliders(tmp_path: Path) -> None:
     """The rod turns by 0.5 rad a frame about its centre; the post rests. A quaternion turns as the motion does."""
     export(run(tmp_path / "run", [POST, ROD]), "npz", tmp_path / "out")

@@ -18,6 +18,7 @@ FORMATS = {
     "webdataset": ("webdataset.Webdataset", "archives of .npz and .json per split, for WebDataset"),
     "vtkhdf": ("vtk.Vtkhdf", "a result per trajectory, for ParaView and every command of mpmcli"),
     "vtk": ("vtk.Vtk", "a .vtu per frame and a .pvd, for ParaView before 5.12"),
+    "usd": ("usd.Usd", "a .usdc per trajectory with colliders as meshes, for Omniverse, Houdini and Blender"),
     "ply": ("ply.Ply", "a file of points per frame, for Blender, Houdini, trimesh and VTK"),
 }
 
