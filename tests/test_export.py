@@ -446,6 +446,11 @@ def test_vtkhdf_of_a_dataset_opens_as_a_result(tmp_path, dimension):
     np.testing.assert_array_equal(mpmcli.dataset.open(result.path)[0].position, source.position)
 
 
+def test_an_unknown_format_is_told_the_nearest_one(tmp_path):
+    message = refused(made_dataset(tmp_path / "set"), "parket", tmp_path / "out")
+    assert 'there is no "parket"; did you mean "parquet"?' in message
+
+
 def test_a_table_of_parquet_is_divided_and_has_arrays_where_shapes_agree(tmp_path, monkeypatch):
     """Files as large as allowed, in order; README.md gives fixed shapes to columns whose trajectories agree."""
     reader = pytest.importorskip("pyarrow.parquet")

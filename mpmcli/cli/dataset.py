@@ -167,7 +167,7 @@ def merge(parts: tuple[Path, ...], output: Path, as_json: bool) -> None:
 @click.option(
     "--to",
     "form",
-    type=click.Choice([*FORMATS]),
+    type=options.Word([*FORMATS]),
     required=True,
     help="\b\n" + "\n".join(f"{name}: {what}" for name, (_, what) in FORMATS.items()),
 )

@@ -55,6 +55,21 @@ def output_option(text: str, metavar: str = "DIR", name: str = "output") -> Call
     return click.option("-o", "--output", name, type=PATH, metavar=metavar, help=text)
 
 
+class Word(click.Choice):
+    """One of many long words; an error names the nearest one."""
+
+    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        try:
+            return super().convert(value, param, ctx)
+        except click.BadParameter:
+            from difflib import get_close_matches
+
+            near = get_close_matches(str(value), self.choices, n=1)
+            if not near:
+                raise
+            self.fail(f'there is no "{value}"; did you mean "{near[0]}"?', param, ctx)
+
+
 def choice_option(flags: str, choices: list[str], default: str, text: str) -> Callable:
     """Return an option that takes one of several words; `flags` may name the parameter after a space."""
     return click.option(*flags.split(), type=click.Choice(choices), default=default, show_default=True, help=text)
