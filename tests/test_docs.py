@@ -352,6 +352,18 @@ def test_the_known_answer_of_the_drop_measures_an_error(scripts, tmp_path):
     assert known.elliptical_drop_2d(Fake(1.01)).startswith("half axes +1.00 % and +0.00 %")
 
 
+def test_the_table_of_error_against_seconds_has_every_program(scripts):
+    """On a line of slope 3 mpmcli takes 8 s for the error at which the other takes 4; outside of it there is none."""
+    peers = scripts("peers")
+    page = PAGES["docs/performance.md"]
+    section = page[page.index("<!-- peers:") : page.index("<!-- end of peers -->")]
+    assert all(len(re.findall(rf"^\| {name} \|", section, re.MULTILINE)) >= 4 for name in peers.PROGRAMS)
+    runs = [("mpmcli", 10, 0.1, 1.0), ("mpmcli", 40, 0.025, 64.0), ("mpm88", 10, 0.05, 4.0), ("mpm88", 40, 0.01, 99.0)]
+    rows = [{"program": p, "n": n, "particles": 1, "steps": 1, "error": e, "seconds": s} for p, n, e, s in runs]
+    ratios = [line.split("|")[-2].strip() for line in peers.table(rows).splitlines()[2:]]
+    assert ratios == ["1.00", "1.00", "0.50", ""]
+
+
 def test_a_section_is_replaced_between_its_markers(scripts, tmp_path):
     file = tmp_path / "page.md"
     file.write_text("before\n<!-- t: by hand -->\nold\n<!-- end of t -->\nafter\n", encoding="utf-8")

@@ -15,7 +15,9 @@ from PIL import Image
 from mpmcli.render.picture_file import digest_of
 
 PICTURES = ROOT / "docs" / "pictures"
-BYTES_MAX, FILM_MAX = 4e6, 1.5e6
+BYTES_MAX, FILM_MAX, PLOT_MAX = 4e6, 1.5e6, 6e4
+# Drawn by scripts/peers with Matplotlib.
+PLOT = PICTURES / "peers.png"
 
 
 @pytest.fixture
@@ -33,16 +35,21 @@ def test_every_scene_has_a_picture() -> None:
     """On the page of the gallery, as test_docs.py says."""
     names = sorted(path.stem for path in (ROOT / "configs").glob("*.toml"))
     tutorial = re.findall(r"\(pictures/(\w+)\.png\)", (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8"))
-    assert sorted(path.stem for path in PICTURES.glob("*.png")) == sorted([*names, *tutorial])
+    assert sorted(path.stem for path in PICTURES.glob("*.png") if path != PLOT) == sorted([*names, *tutorial])
 
 
 def test_pictures_are_small_and_of_mpmcli() -> None:
     assert sum(path.stat().st_size for path in PICTURES.iterdir()) < BYTES_MAX
-    for path in PICTURES.glob("*.png"):
+    for path in set(PICTURES.glob("*.png")) - {PLOT}:
         assert digest_of(path), path.name
         with Image.open(path) as picture:
             # Not blank, and nothing but what a page can hold.
             assert picture.width == 760 and len(picture.convert("RGB").getcolors(2**24)) > 20
+
+
+def test_the_plot_is_small_and_fits_the_page() -> None:
+    with Image.open(PLOT) as picture:
+        assert picture.width == 900 and PLOT.stat().st_size < PLOT_MAX
 
 
 def test_the_film_is_small_and_moves() -> None:
