@@ -132,6 +132,7 @@ def test_a_cloud_has_the_arrays_of_a_frame(tmp_path: Path, dimension: int) -> No
         (lambda data, _: mpmcli.run(data), "the scene comes from no file that could name its result: give output"),
         (lambda data, _: mpmcli.run(mpmcli.load_scene(data)), "give output, a directory"),
         (lambda data, _: mpmcli.load_scene(mpmcli.load_scene(data), title="b"), "give its overrides to load_scene"),
+        (lambda data, _: mpmcli.run(data, "out", resume=True, overwrite=True), "give one of them"),
         (lambda data, _: mpmcli.sweep("none.toml"), "none.toml: there is no such file"),
         (lambda data, dataset: dataset.windows("trian"), 'there is no split "trian": the splits are "train", "valid"'),
         (lambda data, dataset: dataset.windows(past=0), "a window has one past frame or more"),

@@ -12,7 +12,6 @@ from mpmcli.cli.interrupt import interrupt_came, interrupted_code, interrupts_wa
 from mpmcli.cli.options import COUNT, PATH, json_option, quiet_option
 from mpmcli.cli.streams import print_answer, print_json, print_note, print_text
 from mpmcli.dataset.formats import FORMATS
-from mpmcli.errors import InputError
 
 # Time in which the workers of a sweep and this process end, s.
 RESERVE = 5.0
@@ -68,8 +67,6 @@ def sweep_command(
     loaded = load_sweep(sweep, laws=load_plugins(given["plugins"]), count=count, overrides=overrides)
     directory = given["directory"] = given["directory"] or Path("datasets") / sweep.stem
     settings = SweepSettings(**given)
-    if settings.overwrite and settings.resume:
-        raise InputError("--resume keeps an earlier dataset, and --overwrite removes it: give one of them.")
     if dry_run:
         rehearsal = rehearse(loaded, settings)
         print_answer(rehearsal, as_json)

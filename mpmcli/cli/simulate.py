@@ -13,7 +13,7 @@ from mpmcli.cli.interrupt import interrupt_came, interrupted_code, interrupts_wa
 from mpmcli.cli.options import COUNT, SCENE, json_option, quiet_option
 from mpmcli.cli.streams import print_answer, print_error, print_json, print_note, print_text
 from mpmcli.cli.supervisor import announce
-from mpmcli.errors import InputError, RunError
+from mpmcli.errors import RunError
 
 if TYPE_CHECKING:
     from mpmcli.error_bars.study import StudyPlan
@@ -69,8 +69,6 @@ def simulate_command(
     from mpmcli.simulation.settings import Limits
     from mpmcli.simulation.simulate import RunSettings, simulate
 
-    if run["resume"] and run["overwrite"]:
-        raise InputError("--resume keeps an earlier result, and --overwrite removes it: give one of them.")
     overrides = run.pop("overrides")
     overrides += (f'solver.precision="{precision}"',) if precision else ()
     overrides += ("output.compress=true",) if run.pop("compress") else ()

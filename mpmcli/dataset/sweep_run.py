@@ -80,6 +80,10 @@ class SweepSettings:
     threads: int | None = 1
     plugins: tuple[Path, ...] = ()
 
+    def __post_init__(self) -> None:
+        if self.resume and self.overwrite:
+            raise InputError("--resume keeps an earlier dataset, and --overwrite removes it: give one of them.")
+
 
 @dataclass
 class SweepState:

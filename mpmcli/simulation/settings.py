@@ -151,3 +151,7 @@ class RunSettings:
     compile_cache: bool = True
     limits: Limits = field(default_factory=Limits)
     command: Sequence[str] = ()
+
+    def __post_init__(self) -> None:
+        if self.resume and self.overwrite:
+            raise InputError("--resume keeps an earlier result, and --overwrite removes it: give one of them.")
