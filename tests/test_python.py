@@ -7,17 +7,20 @@ import tomllib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from command import ROOT, SCENE
+from command import ROOT, SCENE, run_here
+from good_sweep import BASE, SWEEP, sweep_of
 from made_dataset import made_trajectory, write_dataset
 from made_result import write_made
+from made_sweep import COUNT, VERDICTS, made_workers  # noqa: F401
 
 import mpmcli
 import mpmcli.dataset
 from mpmcli.dataset import Dataset
-from mpmcli.errors import InputError
+from mpmcli.errors import InputError, RunError
 from mpmcli.frames.frame import ACTIVE, BLOCKED, RETIRED, WAITING
 from mpmcli.output import Result, open_result
 
@@ -122,6 +125,27 @@ def test_a_cloud_has_the_arrays_of_a_frame(tmp_path: Path, dimension: int) -> No
     np.testing.assert_array_equal(cloud["velocity"][:, :dimension], frame.velocity)
     np.testing.assert_array_equal(cloud["body"], frame.body)
     assert set(result.field_names) <= set(cloud.point_data)
+
+
+@pytest.mark.usefixtures("made_workers")
+def test_a_sweep_opens_its_dataset_and_its_export_has_the_verdicts(tmp_path: Path) -> None:
+    """Without the trajectories that are left out."""
+    sweep_of(SWEEP, BASE, COUNT)
+    dataset = mpmcli.sweep("sweep.toml", "set", count=COUNT, progress=False)
+    assert set(dataset.numbers) == {*range(COUNT)} - {*VERDICTS}
+    assert run_here("export", "set", "--to", "npz", "-o", "out", "-q").status == 0
+    told = json.loads((tmp_path / "out" / "metadata.json").read_text(encoding="utf-8"))["verdict"]
+    assert told == {f"{number:06d}": "stable" for number in dataset.numbers}
+
+
+@pytest.mark.parametrize(
+    ("status", "error"), [("unstable", RunError), ("failed", RunError), ("interrupted", KeyboardInterrupt)]
+)
+def test_a_run_that_ends_early_raises(monkeypatch: pytest.MonkeyPatch, status: str, error: type) -> None:
+    summary = SimpleNamespace(status=status, message="it ended at 0.1 s", check=None)
+    monkeypatch.setattr("mpmcli.api.simulate", lambda *_: summary)
+    with pytest.raises(error, match="it ended"):
+        mpmcli.run(tomllib.loads(SCENE), "out", progress=False)
 
 
 @pytest.mark.parametrize(

@@ -118,7 +118,8 @@ def export(
                 "its sweep was interrupted, or a file is missing; --trajectory N exports one that is there."
             )
         lack, told = status.lack(), status.as_dict()
-        metadata["verdict"] = {group_name(row.number): row.verdict for row in status.rows if row.number in {*numbers}}
+        taken = {*numbers}
+        metadata["verdict"] = {group_name(row.number): row.verdict for row in status.rows if row.number in taken}
         metadata["dataset"] = {name: told[name] for name in ("part", "trajectories", "done", "accepted", "verdicts")}
     if any(each.particle_count < each.source.particle_count for each in chosen):
         metadata["particle_seed"] = SEED
