@@ -13,7 +13,7 @@ FORMATS = {
     "tfrecord": ("tfrecord.TfRecord", "train.tfrecord, valid.tfrecord, test.tfrecord of Learning to simulate"),
     "neuralmpm": ("neuralmpm.NeuralMpm", "train/sim_0.h5 and so on for NeuralMPM"),
     "npz": ("npz.Npz", "a file of plain arrays per trajectory, for NumPy"),
-    "parquet": ("parquet.Parquet", "a table per split and README.md, for load_dataset of Hugging Face"),
+    "parquet": ("parquet.Parquet", "a table per split, README.md and croissant.json, for load_dataset of Hugging Face"),
     "zarr": ("zarr.Zarr", "a store of Zarr 3, a group per trajectory, chunked by frames"),
     "webdataset": ("webdataset.Webdataset", "archives of .npz and .json per split, for WebDataset"),
     "vtkhdf": ("vtk.Vtkhdf", "a result per trajectory, for ParaView and every command of mpmcli"),

@@ -10,12 +10,15 @@ from typing import Any
 import numpy as np
 
 from mpmcli.dataset.formats.arrays import ArraysFormat, ExportedArray, arrays_of
+from mpmcli.dataset.formats.croissant import croissant
 from mpmcli.dataset.shard import SPLITS
 from mpmcli.errors import InputError
+from mpmcli.output.checksums import path_digest
 from mpmcli.plain_text import one_line
 
 # Arrays of datasets have up to five axes, and lists as many numbers as 31 bits count.
 MOST_AXES, LARGEST = 5, 2**31 - 1
+_ABOUT = "Trajectories of particles computed with mpmcli, one in each row; lengths in m, times in s."
 _CARD = """\
 ---
 configs:
@@ -29,7 +32,7 @@ dataset_info:
 
 # {title}
 
-Trajectories of particles computed with mpmcli, one in each row; lengths in m, times in s. `metadata.json` has spacings,
+{about} `metadata.json` has spacings,
 the names of laws and bodies, and statistics of motion.
 
 ```python
@@ -41,14 +44,14 @@ position = dataset["{split}"][0]["position"]    # (T, N, {dimension})
 
 
 class Parquet(ArraysFormat):
-    """A table per split, in files of at most 500 MB, and README.md with the splits and the types of columns.
+    """A table per split, in files of at most 500 MB, and README.md and croissant.json with splits and types of columns.
 
     Columns are the number and the draws (JSON) of a trajectory, and its arrays as nested lists. The column of an array
     whose axes have the same length in all trajectories, but for the first, is an Array2D to Array5D of datasets: these
     become arrays of NumPy a hundred times faster than lists. A trajectory without an array has null.
     """
 
-    files = r"(train|valid|test)-\d{5}-of-\d{5}\.parquet|README\.md"
+    files = r"(train|valid|test)-\d{5}-of-\d{5}\.parquet|README\.md|croissant\.json"
     package, extra = "pyarrow", "huggingface"
 
     def check(self) -> None:
@@ -73,14 +76,17 @@ class Parquet(ArraysFormat):
                 found.setdefault(name, []).append(ExportedArray(array.dtype, array.shape, tuple))
         return found
 
+    def _lengths(self, name: str) -> list[int | None]:
+        """Return the lengths of the axes of a column, None where trajectories differ."""
+        axes = zip(*(array.shape for array in self._columns[name]), strict=True)
+        return [lengths[0] if len({*lengths}) == 1 else None for lengths in axes]
+
     def _feature(self, name: str) -> dict[str, Any]:
         """Return the type of a column for datasets."""
-        found = self._columns[name]
-        dtype, axes = found[0].dtype.name, len(found[0].shape)
-        alike = len({array.shape[1:] for array in found}) == 1 and len(found) == len(self.trajectories)
+        found, shape = self._columns[name], self._lengths(name)
+        dtype, axes = found[0].dtype.name, len(shape)
+        alike = None not in shape[1:] and len(found) == len(self.trajectories)
         if alike and 1 < axes <= MOST_AXES:
-            lengths = {array.shape[0] for array in found}
-            shape = [lengths.pop() if len(lengths) == 1 else None, *found[0].shape[1:]]
             return {"name": name, "dtype": {f"array{axes}_d": {"shape": shape, "dtype": dtype}}}
         kind: Any = dtype
         for _ in range(axes):
@@ -106,19 +112,32 @@ class Parquet(ArraysFormat):
                     writer.write_batch(pa.record_batch(columns, schema=pa.schema(types)))
                     tick()
         (directory / "README.md").write_text(self._card(), encoding="utf-8", newline="\n")
+        files = {path.name: (path.stat().st_size, path_digest(path)) for path in sorted(directory.glob("*.parquet"))}
+        columns = {"number": (np.dtype("int64"), ()), "draws": (None, ())}
+        for name, found in self._columns.items():
+            columns[name] = found[0].dtype, [-1 if one is None else one for one in self._lengths(name)]
+        text = json.dumps(croissant(files, self._splits, columns, name=self._title, description=_ABOUT), indent=2)
+        (directory / "croissant.json").write_text(text + "\n", encoding="utf-8", newline="\n")
+
+    @property
+    def _title(self) -> str:
+        return one_line(self.trajectories[0].source.header.title or "Trajectories of particles")
+
+    @property
+    def _splits(self) -> list[str]:
+        there = {each.source.split for each in self.trajectories}
+        return [split for split in SPLITS if split in there]
 
     def _card(self) -> str:
-        there = {each.source.split for each in self.trajectories}
-        splits = [split for split in SPLITS if split in there]
         features = [{"name": "number", "dtype": "int64"}, {"name": "draws", "dtype": "string"}]
         features += map(self._feature, self._columns)
-        first = self.trajectories[0]
         return _CARD.format(
-            files="\n".join(f"  - split: {split}\n    path: {split}-*.parquet" for split in splits),
+            files="\n".join(f"  - split: {split}\n    path: {split}-*.parquet" for split in self._splits),
             features="\n".join(f"  - {json.dumps(feature)}" for feature in features),
-            title=one_line(first.source.header.title or "Trajectories of particles"),
-            split=splits[0],
-            dimension=first.layout.dimension,
+            title=self._title,
+            about=_ABOUT,
+            split=self._splits[0],
+            dimension=self.trajectories[0].layout.dimension,
         )
 
 
