@@ -187,7 +187,7 @@ class Moments:
     @classmethod
     def of(cls, vectors: np.ndarray) -> "Moments":
         """Return the moments of (..., d) vectors, at least one."""
-        rows = vectors.reshape(-1, vectors.shape[-1]).astype(np.float64)
+        rows = vectors.reshape(-1, vectors.shape[-1]).astype(np.float64, copy=False)
         mean = rows.mean(axis=0)
         return cls(len(rows), mean, np.square(rows - mean).sum(axis=0))
 
@@ -238,7 +238,8 @@ def _of_trajectory(blocks: Iterable[np.ndarray], period: np.ndarray | None) -> t
 
 
 def _with(moments: Moments | None, vectors: np.ndarray) -> Moments | None:
-    found = vectors[np.isfinite(vectors).all(axis=-1)]
+    finite = np.isfinite(vectors)
+    found = vectors if finite.all() else vectors[finite.all(axis=-1)]
     if found.size == 0:
         return moments
     return Moments.of(found) if moments is None else moments.merged(Moments.of(found))
