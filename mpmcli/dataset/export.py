@@ -6,6 +6,7 @@ import os
 import re
 import shutil
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -27,6 +28,8 @@ from mpmcli.plain_json import finite_json
 from mpmcli.plain_text import counted, size_text
 
 METADATA = "metadata.json"
+# Threads that wait for the disk, which stores many small files together.
+SYNCS = 4
 
 
 @dataclass(frozen=True)
@@ -201,8 +204,8 @@ def new_directory(directory: Path, overwrite: bool) -> Iterator[Path]:
             reason = error.strerror or error
             raise InputError(f"{directory} cannot be made ({reason}): give another place with -o.") from error
         yield temporary
-        for path in _files(temporary).values():
-            sync_file(path)
+        with ThreadPoolExecutor(SYNCS) as threads:
+            list(threads.map(sync_file, _files(temporary).values()))
         if target.exists():
             # Files may have appeared in it meanwhile.
             check_export_directory(directory, overwrite)
