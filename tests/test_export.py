@@ -4,6 +4,7 @@ import io
 import json
 import os
 import pickletools
+import re
 import shutil
 import sys
 import tarfile
@@ -600,6 +601,9 @@ def test_another_package_reads_tfrecords(tmp_path):
     dataset = mpmcli.dataset.open(path)
     assert metadata_of(tmp_path / "out")["sequence_length"] == FRAMES - 1
     for split, numbers in dataset.splits.items():
+        # In one order, whatever the process.
+        names = re.findall(rb"key|particle_type", (tmp_path / "out" / f"{split}.tfrecord").read_bytes())
+        assert names == [b"key", b"particle_type"] * len(numbers)
         found = tfrecords(tmp_path / "out" / f"{split}.tfrecord", 2)
         assert len(found) == len(numbers)
         for (position, kinds), number in zip(found, numbers, strict=True):

@@ -1,5 +1,6 @@
 """The format of DeepMind's "Learning to simulate", from which GNS comes, and which PhysicsNeMo reads."""
 
+import struct
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -28,14 +29,22 @@ class TfRecord(Gns):
         return {"sequence_length": self.trajectories[0].frame_count - 1}, []
 
     def write_split(self, path: Path, chosen: Sequence[SubsampledTrajectory], tick: Callable[[], None]) -> None:
+        from tfrecord import example_pb2 as types
         from tfrecord.writer import TFRecordWriter
 
-        writer = TFRecordWriter(str(path))
-        try:
+        def feature(value: bytes) -> types.Feature:
+            return types.Feature(bytes_list=types.BytesList(value=[value]))
+
+        with open(path, "wb") as file:
             for k, each in enumerate(chosen):
-                context = {"key": (k, "int"), "particle_type": (self.particle_types(each).tobytes(), "byte")}
-                frames = [frame.astype("<f4").tobytes() for block in each.whole_blocks() for frame in block]
-                writer.write(context, {"position": (frames, "byte")})
+                key = types.Feature(int64_list=types.Int64List(value=[k]))
+                context = {"key": key, "particle_type": feature(self.particle_types(each).tobytes())}
+                frames = [feature(frame.astype("<f4").tobytes()) for block in each.whole_blocks() for frame in block]
+                lists = types.FeatureLists(feature_list={"position": types.FeatureList(feature=frames)})
+                example = types.SequenceExample(context=types.Features(feature=context), feature_lists=lists)
+                # TFRecordWriter.write has keys in an order that differs from one process to the next.
+                record = example.SerializeToString(deterministic=True)
+                for piece in (struct.pack("<Q", len(record)), record):
+                    file.write(piece)
+                    file.write(TFRecordWriter.masked_crc(piece))
                 tick()
-        finally:
-            writer.close()
