@@ -1,8 +1,9 @@
-"""Programs of others read what mpmcli writes: datasets, mlcroissant, WebDataset, Zarr, GNS's loader, pvpython.
+"""Programs of others read what mpmcli writes: datasets, mlcroissant, WebDataset, Zarr, GNS, NeuralMPM, pvpython.
 
 MPMCLI_CONSUMERS names a directory of environments, as scripts/consumers makes them: `datasets` and `webdataset` with
 those packages; `croissant` with mlcroissant and pyarrow; `gns` with numpy and GNS's data_loader.py, which takes from
-torch its base class alone. pvpython is the one on the path. What is absent is skipped.
+torch its base class alone; `neuralmpm` with numpy, h5py and the parsers of NeuralMPM, which take tensors from torch.
+pvpython is the one on the path. What is absent is skipped.
 """
 
 import json
@@ -230,7 +231,7 @@ def test_webdataset_reads_its_shards(tmp_path: Path, monkeypatch: pytest.MonkeyP
 GNS = """
 import json, sys
 from types import SimpleNamespace as Name
-sys.path.insert(0, sys.argv[1])
+sys.path.insert(0, sys.argv[1] + "/gns")
 sys.modules["torch"] = Name(utils=Name(data=Name(Dataset=object)))
 from data_loader import SamplesDataset
 data = SamplesDataset(sys.argv[2], int(sys.argv[3]))
@@ -260,6 +261,53 @@ def test_gns_reads_samples_with_its_own_loader(
     first = np.asarray(made[1].body) == 0
     assert found["kind"] == np.where(first, 5, 6).tolist()
     assert found["feature"] == ([np.where(first, viscosity, 0.0).tolist()] if viscosity else [])
+
+
+NEURALMPM = """
+import json, sys
+from types import SimpleNamespace as Name
+import numpy as np
+class Tensor(np.ndarray):
+    def long(self):
+        return self.astype(np.int64)
+def tensor(function):
+    return lambda *args, **options: function(*args, **options).view(Tensor)
+def cat(parts, dim=None, axis=None):
+    return np.concatenate(parts, dim if axis is None else axis)
+made = {"tensor": np.array, "cat": cat, "zeros": np.zeros, "ones": np.ones, "arange": np.arange}
+sys.modules["torch"] = Name(float32=np.float32, **{name: tensor(made[name]) for name in made})
+sys.modules["neuralmpm.pipelines"] = Name(visualisation=None)
+sys.path.insert(0, sys.argv[1])
+from neuralmpm.data.parsers.nmpm_parser import NMPMParser
+metadata = json.load(open(sys.argv[2] + "/metadata.json"))
+NMPMParser.get_num_types = lambda self: metadata["num_types"]
+parser = NMPMParser(sys.argv[2], metadata["dim"], metadata["dt"], *zip(*metadata["bounds"]))
+found = [parser.parse(int(k), split=sys.argv[3]) for k in sys.argv[4:]]
+print(json.dumps([{name: array.tolist() for name, array in one.items()} for one in found]))
+"""
+
+
+@pytest.mark.parametrize("walls", ["none", "all"])
+def test_neuralmpm_parses_trajectories_with_its_own_parser(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, walls: str
+) -> None:
+    """Positions and displacements of each particle, those on walls first; types; gravity, which differs."""
+    monkeypatch.chdir(tmp_path)
+    made, out = [made_trajectory(k) for k in range(2)], tmp_path / "out"
+    made[1].header["scene"] = made[1].header["scene"].replace("gravity = [-1.0, -1.0]", "gravity = [0.0, -2.0]")
+    path = write_dataset(tmp_path / "set", made)
+    assert run_here("export", path, "--to", "neuralmpm", "-o", out, "--walls", walls).status == 0
+    python = environment("neuralmpm")
+    found = told(python, NEURALMPM, python.parents[1], out, "train", 0, 1)
+    assert [one["grav"] for one in found] == [[-1.0, -1.0], [0.0, -2.0]]
+    for one, source in zip(found, made, strict=True):
+        types, state = np.array(one["types"]), np.array(one["sim"], np.float32)
+        own = types > 0
+        assert (walls == "all") == (not own.all()) and (not own[0]) == (walls == "all")
+        assert types[own].tolist() == (1 + source.material).tolist()
+        np.testing.assert_array_equal(state[:, own, :2], source.position[1:])
+        np.testing.assert_array_equal(state[:, own, 2:], np.diff(source.position, axis=0))
+        assert not state[:, ~own, 2:].any()
 
 
 PARAVIEW = """
