@@ -3,6 +3,8 @@
 import io
 import os
 import shutil
+import signal
+import subprocess
 import sys
 import tarfile
 import tomllib
@@ -29,6 +31,7 @@ from exports import (
 from made_dataset import PAUSE, SPLITS, made_dataset, made_trajectory, write_dataset
 
 import mpmcli.dataset
+from mpmcli.cli.progress import ProgressBar
 from mpmcli.dataset.folder import MANIFEST, Manifest, Row
 from mpmcli.dataset.formats import FORMATS, format_named
 from mpmcli.dataset.subsample import chosen_particles
@@ -199,6 +202,32 @@ def test_an_interrupted_export_leaves_what_was_there(tmp_path, monkeypatch, earl
     monkeypatch.setattr("mpmcli.cli.dataset.interrupt_came", lambda: True)
     assert run_here("export", path, "--to", "npz", "-o", target, "--overwrite").status == 130
     assert everything(tmp_path) == before
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_signal_between_two_trajectories_leaves_nothing(tmp_path, monkeypatch, form):
+    """SIGTERM, which arrives when the first of two in a file is written."""
+    path = made_dataset(tmp_path / "set")
+    monkeypatch.setattr(ProgressBar, "show", lambda *_: signal.raise_signal(signal.SIGTERM))
+    assert run_here("export", path, "--to", form, "-o", tmp_path / "new" / "out").status == 143
+    assert os.listdir(tmp_path) == ["set"]
+
+
+@pytest.mark.parametrize("form", [form for form in FORMS if form.values[0] in ("parquet", "zarr", "webdataset")])
+def test_a_killed_export_has_no_directory_under_its_name(tmp_path, form):
+    """And the next one is as if there had been none."""
+    path, target = made_dataset(tmp_path / "set"), tmp_path / "out"
+    code = (
+        "import os, signal, sys; from mpmcli.cli import program; from mpmcli.cli.progress import ProgressBar\n"
+        "ProgressBar.show = lambda *_: os.kill(os.getpid(), signal.SIGKILL)\n"
+        "program.run(sys.argv[1:])"
+    )
+    words = [sys.executable, "-c", code, "export", path, "--to", form, "-o", target]
+    killed = subprocess.run([*map(str, words)], env={**os.environ, "PYTHONPATH": str(ROOT)}, check=False)
+    assert killed.returncode == -signal.SIGKILL and not target.exists()
+    for name in ("out", "other"):
+        assert run_here("export", path, "--to", form, "-o", tmp_path / name).status == 0
+    assert everything(target) == everything(tmp_path / "other")
 
 
 @pytest.mark.parametrize("replaced", [False, True])
