@@ -100,11 +100,12 @@ def shifted(scene: Scene, x: np.ndarray, C: np.ndarray, mass: np.ndarray, flows:
         return way
 
     near, _ = copies(x, x, faces, size)
-    excess = np.maximum(weights(near, g, size).sum(axis=0) - 1, 0)
+    excess = 2 * np.maximum(weights(near, g, size).sum(axis=0) - 1, 0)
+    crowding = excess * np.minimum(excess**2, 1)
     # Central differences are exact for a spline of second order where no knot is near.
     steps = 1e-6 * g * np.eye(d)
     slope = np.stack(
-        [(weights(x + step, g, size) - weights(x - step, g, size)) @ excess / 2e-6 for step in steps], axis=1
+        [(weights(x + step, g, size) - weights(x - step, g, size)) @ crowding / 2e-6 for step in steps], axis=1
     )
     D = (C + C.transpose(0, 2, 1)) / 2
     strain = 8 * T * np.sqrt(2 * ((D**2).sum((1, 2)) - np.trace(C, axis1=1, axis2=2) ** 2 / 3))

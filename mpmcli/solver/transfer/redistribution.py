@@ -2,7 +2,7 @@
 
 Flow stretches the lattice of particles along its own axes: rows separate and planes pile up. The grid does not resolve
 this, because the weights of planes one cell apart sum to 1. In the steps that relax volumes, a fine grid with about one
-node per particle resolves the crowds. Particles move down the gradient of its filling by an amount that grows with the
+node per particle resolves the crowds. Particles move down the gradient of the crowding by an amount that grows with the
 strain since the last shift. The mean of this motion on the grid is then subtracted. v changes by C times the
 displacement, so that the velocity field does not change.
 
@@ -38,8 +38,10 @@ from mpmcli.solver.transfer.stencils import add_linear, gather_linear, node_of, 
 from mpmcli.solver.transfer.volume import image_along
 from mpmcli.stability.transfer_factors import FARTHEST
 
-# Factor s of the strain e since the last shift: a particle moves by s e / (1 + s e) of the gradient of the filling.
+# Factor s of the strain e since the last shift: a particle moves by s e / (1 + s e) of the gradient of the crowding.
 PUSH = 8.0
+# Excess of the filling over 1 below which it counts less: that of rows of a lattice stretched twice.
+MILD = 0.5
 
 
 def fine_nodes(scene: Scene, laws: Sequence[Law]) -> int:
@@ -64,7 +66,7 @@ class FineGrid(LinearNodes):
     Attributes:
         per_cell: nodes per cell along an axis.
         in_cell: nodes per cell.
-        fill: Vector(1) field: the filled fraction of each fine cell; after `fold_fine` its excess over 1.
+        fill: Vector(1) field: the filled fraction of each fine cell; after `fold_fine` the crowding phi.
     """
 
     width = 1
@@ -162,7 +164,7 @@ def fine_to_float(at: ti.template(), node: ti.template(), time: float):
 
 @ti.func
 def fold_fine(at: ti.template(), node: ti.template(), time: float):
-    """Add values of image nodes beyond the faces of an axis to fine nodes; after the last axis keep the excess over 1.
+    """Add values of image nodes beyond the faces of an axis to fine nodes; after the last axis keep the crowding.
 
     Nodes on a wall count twice, because half of their cell is outside. Images receive the same value.
     """
@@ -182,7 +184,8 @@ def fold_fine(at: ti.template(), node: ti.template(), time: float):
                             beyond = fine.linear_index(place)
                             total += fine.fill[beyond][0]
                         if ti.static(axis == d - 1):
-                            total = ti.max(total - 1.0, 0.0)
+                            excess = ti.max(total - 1.0, 0.0) / MILD
+                            total = excess * ti.min(excess * excess, 1.0)
                         fine.fill[index][0] = total
                         if exists:
                             fine.fill[beyond][0] = total
@@ -190,7 +193,7 @@ def fold_fine(at: ti.template(), node: ti.template(), time: float):
 
 @ti.func
 def shift(at: ti.template(), p: int, time: float):
-    """Move particle p down the gradient of the filling; add its mass and mass times displacement to its nodes."""
+    """Move particle p down the gradient of the crowding; add its mass and mass times displacement to its nodes."""
     grid, fine, group, d = ti.static((at.grid, at.grid.fine, at.group, at.grid.dimension))
     v, C = group.motion(p)
     x = group.x[p]
@@ -339,7 +342,7 @@ def slope_of(fine: ti.template(), first: ti.template(), w: ti.template(), distan
 
 @ti.func
 def way_down(at: ti.template(), slope: ti.template(), C: ti.template(), time: float):
-    """Return the displacement of a particle down the gradient of the filling, m; 0 at zero strain rate."""
+    """Return the displacement of a particle down the gradient of the crowding, m; 0 at zero strain rate."""
     strain = PUSH * time * shear_rate(C)
     way = -strain / (1.0 + strain) * slope
     return way * (FARTHEST / ti.max(way.norm(), FARTHEST) * (at.grid.spacing * ti.static(1.0 / at.grid.fine.per_cell)))

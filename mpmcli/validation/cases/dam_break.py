@@ -249,6 +249,6 @@ class DamBreakObstacle(Case):
             "impact": impact(time, np.array(fronts)) - IMPACT,
             "first force": arrival(middle, force, force.max() / 10) - IMPACT,
             "peak": float(middle[np.argmax(smooth)]) - IMPACT,
-            "largest force": float(force.max()) / (DENSITY * SPEED**2 / 2 * face),
+            "largest force": float(smooth.max()) / (DENSITY * SPEED**2 / 2 * face),
             "depth in the box": deepest * n / WIDTH,
         }
