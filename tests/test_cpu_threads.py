@@ -24,13 +24,13 @@ class EarlyThread:
 
     @ti.kernel
     def come(self, numbers: RunReals, counts: RunInts, frame_buffer: FrameBuffer) -> int:
-        """Return what it finds to do, see `CpuThreads.help`."""
+        """Return what it finds to do, see `CpuThreads.process_part`."""
         found = 0
         ti.loop_config(serialize=True)
         for _ in range(1):
             self.team.open(0)
             self.team.enter(0)
-            found = self.team.help(0, 1, RESPECT, numbers, counts, frame_buffer)
+            found = self.team.process_part(0, 1, RESPECT, numbers, counts, frame_buffer)
         return found
 
 

@@ -109,10 +109,10 @@ class BodyContact(Feature):
         self._rows, self._count = Rows(self.rows, self.surfaces.band), Rows(self.surfaces.count)
         self.pairs, self.loads = layers.pairs, Loads(layers.pairs + 1, grid.shape, runs, on_cpu=on_cpu)
         self.extremes = ti.field(float, shape=(runs, len(EXTREMES)))
-        self.share = (2 * grid.dimension + 2) * self.capacity
+        self.stride = (2 * grid.dimension + 2) * self.capacity
         self.threads = max(LEAST_THREADS, GPU_THREADS // runs)
         at_once = max(runs, threads) if on_cpu else runs * self.threads
-        self.points = ti.field(float, shape=2 * at_once * self.share + LANES)
+        self.points = ti.field(float, shape=2 * at_once * self.stride + LANES)
 
     def write(self, scene: Scene, run: int = 0) -> None:
         """Set the numbers of the layers of a run, and the friction between them."""
@@ -339,7 +339,7 @@ class BodyContact(Feature):
             for side in range(2):
                 stay_rolled(self.points, at.thread + side)
                 towards = ti.select(side == 0, -n_c, n_a)
-                met = self.normal_along((2 * at.thread + side) * self.share, counts[side], towards)
+                met = self.normal_along((2 * at.thread + side) * self.stride, counts[side], towards)
                 for b in ti.static(range(d)):
                     faces[side, b] = met[b]
                     alike += faces[0, b] * faces[1, b]
@@ -387,7 +387,7 @@ class BodyContact(Feature):
             deepest: overlap of the deepest of them, m.
         """
         obstacles, h, d = ti.static((at.obstacles, at.grid.spacing, self.dimension))
-        x, first, area, deepest, weights = place_of(at.node, h), 2 * at.thread * self.share, 0.0, 0.0, 0.0
+        x, first, area, deepest, weights = place_of(at.node, h), 2 * at.thread * self.stride, 0.0, 0.0, 0.0
         force, mean = ti.Vector.zero(float, d), ti.Vector.zero(float, d)
         # Whether the obstacle is plane here, which saves most evaluations of its distance.
         plane, place = True, ti.Vector.zero(float, d)
@@ -440,7 +440,7 @@ class BodyContact(Feature):
         gap, axis, means = LARGEST, ti.Vector.zero(float, d), ti.Matrix.zero(float, 2, d)
         for side in range(2):
             stay_rolled(self.points, thread + side)
-            own, other = (2 * thread + side) * self.share, (2 * thread + 1 - side) * self.share
+            own, other = (2 * thread + side) * self.stride, (2 * thread + 1 - side) * self.stride
             row = ti.select(side == 0, row_a, row_c)
             beta = self.rows[row, SHARPNESS]
             inside = -CONVEX / self.rows[ti.select(side == 0, row_c, row_a), SHARPNESS]
@@ -535,7 +535,7 @@ class BodyContact(Feature):
                                         slopes[side, b] += weight * self.surfaces.surface[g][p][d + 1 + b]
                                     depth = self.surfaces.surface[g][p][d]
                                     if counts[side] < self.capacity:
-                                        slot = (2 * at.thread + side) * self.share + counts[side]
+                                        slot = (2 * at.thread + side) * self.stride + counts[side]
                                         if c >= self.layers:
                                             # The point moves with v + C (y - x), C = D^-1 sum w_i v_i (x_i - x)^T.
                                             lever = depth * way.dot(n) * grid.inverse_spacing**2
@@ -557,7 +557,7 @@ class BodyContact(Feature):
     def distance_along(self, at: ti.template(), side: int, count: int, row: int, axis: ti.template()):
         """Return the distance of a node from the surface of a body along an outward axis, m."""
         d = ti.static(self.dimension)
-        first, beta = (2 * at.thread + side) * self.share, self.rows[row, SHARPNESS]
+        first, beta = (2 * at.thread + side) * self.stride, self.rows[row, SHARPNESS]
         inverse_width = ti.static(0.5 / BALL) * at.grid.inverse_spacing
         total, begin = 0.0, 0
         while begin < count:

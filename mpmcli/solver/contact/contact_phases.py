@@ -19,13 +19,16 @@ def contact_phases(groups: Sequence[ParticleArrays], *, serial: bool) -> tuple[P
         if serial
         else (
             Phase("reserve", "nodes", "exchange", item=reserve_item),
-            *(Phase("put", "particles", "exchange", g, item=put_item) for g in shown),
-            Phase("chain", "nodes", "exchange", item=chain_item),
+            *(Phase("store", "particles", "exchange", g, item=store_item) for g in shown),
+            Phase("link_slots", "nodes", "exchange", item=link_item),
         )
     )
     return (
         Phase("find_bodies", "nodes", "exchange", part=find_part, item=find_item, words="find bodies that meet"),
-        *(Phase("show_surface", "particles", "exchange", g, part=show_part, item=show_item) for g in shown),
+        *(
+            Phase("find_surface", "particles", "exchange", g, part=find_surface_part, item=find_surface_item)
+            for g in shown
+        ),
         *lists,
         Phase("exchange", "threads", "exchange", part=exchange_part, item=exchange_item, words=PUSH),
     )
@@ -66,7 +69,7 @@ def near_bodies(phases: ti.template(), at: ti.template()):
 def rows_near_bodies(phases: ti.template(), grid: ti.template(), at: ti.template()):
     """Return the first row of a part of the nodes where bodies may be in contact, and the one after the last."""
     first, after = phases.places.even_part(grid.row_count(), at.region)
-    return phases.share(first, after, at.part)
+    return phases.range_of_part(first, after, at.part)
 
 
 @ti.func
@@ -96,18 +99,18 @@ def find_item(phases: ti.template(), at: ti.template()):
 
 
 @ti.func
-def show_part(phases: ti.template(), at: ti.template()):
+def find_surface_part(phases: ti.template(), at: ti.template()):
     """Find the surface data of particles of the g-th group."""
     (surfaces,) = ti.static((phases.device.features.contact.surfaces,))
     (grid,) = ti.static(near_bodies(phases, at))
     first, after = phases.places.even_part(surfaces.tile_count(grid, at.w), at.region)
-    first, after = phases.share(first, after, at.part)
+    first, after = phases.range_of_part(first, after, at.part)
     for q in range(first, after):
-        surfaces.show(at.g, grid, at.w, q)
+        surfaces.find_surface_points(at.g, grid, at.w, q)
 
 
 @ti.func
-def show_item(phases: ti.template(), at: ti.template()):
+def find_surface_item(phases: ti.template(), at: ti.template()):
     """Find the surface data of a particle."""
     (grid,) = ti.static(near_bodies(phases, at))
     phases.device.features.contact.surfaces.count_particle(at.g, grid, at.w, at.q)
@@ -131,16 +134,16 @@ def reserve_item(phases: ti.template(), at: ti.template()):
 
 
 @ti.func
-def put_item(phases: ti.template(), at: ti.template()):
+def store_item(phases: ti.template(), at: ti.template()):
     """Store a particle in its reserved space."""
     (grid,) = ti.static(near_bodies(phases, at))
-    phases.device.features.contact.surfaces.put(at.g, grid, at.w, at.q)
+    phases.device.features.contact.surfaces.store_particle(at.g, grid, at.w, at.q)
 
 
 @ti.func
-def chain_item(phases: ti.template(), at: ti.template()):
+def link_item(phases: ti.template(), at: ti.template()):
     """Make lists of the surface data at a node."""
-    at_bins(phases, at, phases.device.features.contact.surfaces.chain)
+    at_bins(phases, at, phases.device.features.contact.surfaces.link_slots)
 
 
 @ti.func

@@ -539,7 +539,7 @@ class BodySurfaces:
         return place
 
     @ti.func
-    def show(self, g: ti.template(), grid: ti.template(), w: int, q: int):
+    def find_surface_points(self, g: ti.template(), grid: ti.template(), w: int, q: int):
         """Find the surface data of the particles of the g-th group in the q-th tile."""
         tile, place = self.tile_at(grid, self.orders[g], w, q)
         begin, end = self.orders[g].start[tile], self.orders[g].start[tile + 1]
@@ -549,10 +549,10 @@ class BodySurfaces:
                 end = begin
         self.end[g][tile] = end
         for p in range(begin, self.end[g][tile]):
-            self.show_particle(g, grid, w, p)
+            self.find_surface_point(g, grid, w, p)
 
     @ti.func
-    def show_particle(self, g: ti.template(), grid: ti.template(), w: int, p: int):
+    def find_surface_point(self, g: ti.template(), grid: ti.template(), w: int, p: int):
         """Find the surface data of a particle of the g-th group."""
         d, group = ti.static((self.dimension, self.groups[g]))
         base, _ = grid.scheme.spline.stencil(group.x[p], grid.inverse_spacing)
@@ -605,7 +605,7 @@ class BodySurfaces:
     @ti.func
     def count_particle(self, g: ti.template(), grid: ti.template(), w: int, p: int):
         """Find the surface data of a particle of the g-th group, and count it in its bin."""
-        self.show_particle(g, grid, w, p)
+        self.find_surface_point(g, grid, w, p)
         if self.shown[g][p] != HIDDEN:
             self.rank[g][p] = ti.atomic_add(self.counted[g][self.bin_at(g, grid, w, p)], 1)
 
@@ -618,13 +618,13 @@ class BodySurfaces:
                 self.first[g][place] = begin + ti.atomic_add(self.reserved[g][w], self.counted[g][place])
 
     @ti.func
-    def put(self, g: ti.template(), grid: ti.template(), w: int, p: int):
+    def store_particle(self, g: ti.template(), grid: ti.template(), w: int, p: int):
         """Store a particle of the g-th group in its slot."""
         if self.shown[g][p] != HIDDEN:
             self.slots[g][self.first[g][self.bin_at(g, grid, w, p)] + self.rank[g][p]] = p
 
     @ti.func
-    def chain(self, _w: int, place: int):
+    def link_slots(self, _w: int, place: int):
         """Link the slots of the bins of a node to lists."""
         for g in ti.static(self.surfaced):
             if self.counted[g][place] > 0:

@@ -35,7 +35,7 @@ from mpmcli.solver.transfer.splines import PAD
 
 FrameStats = ti.types.ndarray(ti.f64, 3)
 # Names in the profile of phases outside a step.
-BESIDE = {"forget": "sort", "mark": "sort", "average_shown": "frame", "show": "frame"}
+BESIDE = {"forget": "sort", "mark": "sort", "average_for_frame": "frame", "write_frame": "frame"}
 
 
 @ti.data_oriented
@@ -105,13 +105,13 @@ class CpuLaunch:
             run.frame_recorded = 0
         while goes_on:
             if t == 0 and self.team.finished(w):
-                phase = self.lead(run, phase, frame_stats)
+                phase = self.finish_phase(run, phase, frame_stats)
                 if phase >= 0:
                     self.team.publish(w, phase)
                 else:
                     goes_on = False
             if goes_on:
-                found = self.team.help(w, t, idle, numbers, counts, frame_buffer)
+                found = self.team.process_part(w, t, idle, numbers, counts, frame_buffer)
                 idle = 0 if found == 1 else idle + 1
                 if found < 0 or (idle > LOOKS_IN_VAIN and t > 0):
                     goes_on = False
@@ -123,7 +123,7 @@ class CpuLaunch:
                 self.measure(run)
 
     @ti.func
-    def lead(self, run: ti.template(), done: int, frame_stats: ti.template()):
+    def finish_phase(self, run: ti.template(), done: int, frame_stats: ti.template()):
         """Do the work after phase `done`, -1 at the start of a launch; return the next phase, -1 for none."""
         phase = done
         if phase < 0:
@@ -133,19 +133,19 @@ class CpuLaunch:
             run.frame_recorded = 0
         elif phase == self.phases.last_of_sort:
             self.end_sort(run)
-        elif phase == self.phases.showing:
+        elif phase == self.phases.last_of_frame:
             self.record(run, frame_stats)
             run.frame_recorded = 1
         elif phase >= self.phases.sorts:
             self.sort_on(run, phase)
-        inside = phase >= 0 and phase != self.phases.showing and run.status != CROWDED
+        inside = phase >= 0 and phase != self.phases.last_of_frame and run.status != CROWDED
         if inside and phase != self.phases.last_of_step and phase != self.phases.last_of_sort:
             phase += 1
         else:
             phase = -1
             arrived = run.arrived == 1
             if arrived and run.records == 1 and run.status != LOST and run.frame_recorded == 0:
-                phase = self.phases.before_showing
+                phase = self.phases.first_of_frame
             elif run.status == GOING and not arrived and run.budget > 0:
                 if ti.static(self.emission.needed):
                     self.enter(run)
@@ -327,7 +327,7 @@ class CpuLaunch:
     def next_phase(self, phase: int, numbers: RunReals, counts: RunInts, frame_stats: FrameStats) -> int:
         """Do the work after a phase of the only run; return the next phase."""
         (run,) = ti.static((self.phases.state(0, numbers, counts),))
-        return self.lead(run, phase, frame_stats)
+        return self.finish_phase(run, phase, frame_stats)
 
     @ti.kernel
     def work(self, phase: int, numbers: RunReals, counts: RunInts, frame_buffer: FrameBuffer):
@@ -341,7 +341,7 @@ class CpuLaunch:
             if q % CHUNK == 0:
                 self.team.enter(0)
                 while not self.team.finished(0):
-                    _found = self.team.help(0, q // CHUNK, 0, numbers, counts, frame_buffer)
+                    _found = self.team.process_part(0, q // CHUNK, 0, numbers, counts, frame_buffer)
                 self.team.leave(0)
 
     @ti.kernel

@@ -18,7 +18,7 @@ from mpmcli.solver.contact.contact_phases import clear_part
 from mpmcli.solver.engine.device import Device, RunPhases, RunView, Work
 from mpmcli.solver.engine.run_state import Layout
 from mpmcli.solver.engine.step import sorted_fields
-from mpmcli.solver.frames.reader import show_range
+from mpmcli.solver.frames.reader import write_range
 from mpmcli.solver.grid.grid import clear_blocks, clear_rows
 from mpmcli.solver.grid.sparse_grid import BLOCKS, PENCILS
 from mpmcli.solver.particles.sort import (
@@ -49,7 +49,7 @@ RunInts = ti.types.ndarray(ti.i32, 2)
 FrameBuffer = ti.types.ndarray(ndim=2)
 # Number of parts of a loop over the particles or nodes of a region, on a dense grid and on a sparse grid, where parts
 # are whole pencils.
-SHARES, SPARSE_SHARES = 4, 16
+PARTS, SPARSE_PARTS = 4, 16
 
 
 class PartKind(NamedTuple):
@@ -207,24 +207,24 @@ class CpuRegions:
 class CpuPhases(RunPhases):
     """The phases of the runs of a batch; w is the index of a run, region and part those of a part.
 
-    A step begins with `first_of_step`, a sort with `sorts`, and the preparation of a frame ends with `showing`.
+    A step begins with `first_of_step`, a sort with `sorts`, and the preparation of a frame ends with `last_of_frame`.
 
     Attributes:
         shared: whether several threads work on one run.
         regions: number of regions per run, one for each of these threads.
         apart: whether the functions of the parts are kept out of the launch.
         places: ranges of particles and nodes of the regions.
-        shares: parts of a loop over a region.
+        loop_parts: parts of a loop over a region.
         kinds: kinds of parts.
         clears: number of the first phase of steps that do not shift particles.
-        last_of_step, sorts, marking, last_of_sort, before_showing, showing: numbers of phases.
+        last_of_step, sorts, marking, last_of_sort, first_of_frame, last_of_frame: numbers of phases.
         coloured: (group, first phase) of the phases over the pencils of a group.
         passes: number of consecutive phases over the pencils of a group.
     """
 
     def __init__(self, device: Device, layout: Layout) -> None:
         super().__init__(device, layout)
-        self.shares = SPARSE_SHARES if device.grid.sparse else SHARES
+        self.loop_parts = SPARSE_PARTS if device.grid.sparse else PARTS
         self.shared = device.runs == 1 and device.threads > 1
         self.regions = device.threads if self.shared else 1
         # LLVM does not inline a function that has a second call, even one that is never executed. Compilation is a
@@ -258,14 +258,14 @@ class CpuPhases(RunPhases):
         for g, fields in enumerate(self.moved):
             self.sorts_of += (end,)
             end = self._add("sort", g, end, 2 + 2 * len(fields))
-        self.last_of_sort, self.before_showing = end - 1, end
+        self.last_of_sort, self.first_of_frame = end - 1, end
         # Volumes are averaged once more before a frame is shown.
         for g, group in self.members:
             if group.uses_f_bar:
-                end = self._add("average_shown", g, self.before_showing, 1)
-        self.showing = end
+                end = self._add("average_for_frame", g, self.first_of_frame, 1)
+        self.last_of_frame = end
         for g, _ in self.members:
-            self._add("show", g, self.showing, 1)
+            self._add("write_frame", g, self.last_of_frame, 1)
 
     def _add(self, name: str, group: int, first: int, length: int, phase: Phase | None = None) -> int:
         """Number phases, and return the number after the last."""
@@ -308,8 +308,8 @@ class CpuPhases(RunPhases):
         """Return the number of parts of a phase in a region."""
         parts = 1
         if ti.static(self.shared):
-            if phase < self.sorts or phase == self.showing:
-                parts = self.shares
+            if phase < self.sorts or phase == self.last_of_frame:
+                parts = self.loop_parts
             for g, begin in ti.static(self.coloured):
                 colour = phase - begin
                 if colour >= 0 and colour < self.colours:
@@ -318,9 +318,9 @@ class CpuPhases(RunPhases):
         return parts
 
     @ti.func
-    def share(self, first: int, after: int, part: int):
+    def range_of_part(self, first: int, after: int, part: int):
         """Return the first index of a part of a range, and the one after the last."""
-        size, shares = after - first, ti.static(self.shares if self.shared else 1)
+        size, shares = after - first, ti.static(self.loop_parts if self.shared else 1)
         return first + share_start(size, part, shares), first + share_start(size, part + 1, shares)
 
     @ti.real_func
@@ -363,11 +363,11 @@ class CpuPhases(RunPhases):
         """Apply the function of a phase to the nodes in use of all layers."""
         if ti.static(at.grid.sparse):
             first, after = self.places.even_part(at.grid.sizes[PENCILS], at.region)
-            first, after = self.share(first, after, at.part)
+            first, after = self.range_of_part(first, after, at.part)
             nodes_of_blocks(at, at.grid.pencils[first], at.grid.pencils[after], at.step.kick)
         else:
             first, after = self.places.rows_of(at.grid, at.region)
-            first, after = self.share(first, after, at.part)
+            first, after = self.range_of_part(first, after, at.part)
             if ti.static(at.wanted):
                 own = self.used_by(at, 0)
                 (inner,) = ti.static((at.in_layer(0, own),))
@@ -382,7 +382,7 @@ class CpuPhases(RunPhases):
     def shift_nodes(self, at: ti.template()):
         """Apply the function of a phase of a shift to the nodes in use."""
         first, after = self.places.rows_of(at.grid, at.region)
-        first, after = self.share(first, after, at.part)
+        first, after = self.range_of_part(first, after, at.part)
         last_axis = ti.static(self.dimension - 1)
         for row in range(first, after):
             node = at.grid.row_start(row)
@@ -410,7 +410,7 @@ class CpuPhases(RunPhases):
     def each_particle(self, at: ti.template()):
         """Apply the function of a phase to particles."""
         first, after = self.places.particles_of(at.g, at.w, at.region, at.run.particles[at.g])
-        first, after = self.share(first, after, at.part)
+        first, after = self.range_of_part(first, after, at.part)
         ti.static(at.item)(at, first, after, at.step.relaxed)
 
     @ti.func
@@ -418,11 +418,11 @@ class CpuPhases(RunPhases):
         """Clear nodes."""
         if ti.static(at.grid.sparse):
             first, after = self.places.even_part(at.grid.sizes[BLOCKS], at.region)
-            first, after = self.share(first, after, at.part)
+            first, after = self.range_of_part(first, after, at.part)
             clear_blocks(at.grid, first, after)
         else:
             first, after = self.places.rows_of(at.grid, at.region)
-            first, after = self.share(first, after, at.part)
+            first, after = self.range_of_part(first, after, at.part)
             for layer in range(self.layer_count(at)):
                 own = self.used_by(at, layer)
                 (inner,) = ti.static((at.in_layer(layer, own),))
@@ -477,7 +477,7 @@ class CpuPhases(RunPhases):
         relaxed = at.step.relaxed
         if relaxed > 0.0:
             first, after = self.places.particles_of(at.g, at.w, at.region, at.run.particles[at.g])
-            first, after = self.share(first, after, at.part)
+            first, after = self.range_of_part(first, after, at.part)
             change = 0.0
             for p in range(first, after):
                 stay_rolled(at.order.buffers.real, p)
@@ -508,7 +508,7 @@ class CpuPhases(RunPhases):
             (inner,) = ti.static((at.in_layer(layer, own),))
             (grid,) = ti.static((inner.grid.within(own) if at.grid.layers > 1 else at.grid,))
             first, after = self.places.even_part(inner.nodes.images.plane_nodes(grid), at.region)
-            first, after = self.share(first, after, at.part)
+            first, after = self.range_of_part(first, after, at.part)
             for q in range(first, after):
                 if ti.static(rubs):
                     find_friction(inner.nodes.images, grid, q, gravity_step)
@@ -522,12 +522,12 @@ class CpuPhases(RunPhases):
         if ti.static(at.grid.sparse):
             # Whole pencils, because the loads on colliders are summed row by row.
             first, after = self.places.even_part(at.grid.sizes[PENCILS], at.region)
-            first, after = self.share(first, after, at.part)
+            first, after = self.range_of_part(first, after, at.part)
             begin, end = at.grid.pencils[first], at.grid.pencils[after]
             speed_squared = update_blocks(at, begin, end, self.gravity_of(at.step))
         else:
             first, after = self.places.rows_of(at.grid, at.region)
-            first, after = self.share(first, after, at.part)
+            first, after = self.range_of_part(first, after, at.part)
             for layer in range(self.layer_count(at)):
                 own = self.used_by(at, layer)
                 (inner,) = ti.static((at.in_layer(layer, own),))
@@ -540,12 +540,12 @@ class CpuPhases(RunPhases):
         dt, gravity_step = at.step.dt, self.gravity_of(at.step)
         if ti.static(at.grid.sparse):
             first, after = self.places.pencils_of(at.g, at.region)
-            first, after = self.share(first, after, at.part)
+            first, after = self.range_of_part(first, after, at.part)
             begin, end = at.order.first_tile_of(first), at.order.first_tile_of(after)
             ti.atomic_max(at.step.rate[at.g], advance_tiles(at, begin, end, dt, gravity_step))
         else:
             first, after = self.places.particles_of(at.g, at.w, at.region, at.run.particles[at.g])
-            first, after = self.share(first, after, at.part)
+            first, after = self.range_of_part(first, after, at.part)
             rate = advance_range(at.particles, at.g, self.device.groups[at.g], first, after, dt, gravity_step)
             ti.atomic_max(at.step.rate[at.g], rate)
 
@@ -581,14 +581,14 @@ class CpuPhases(RunPhases):
                 take_all(at.order.buffers, field, own, begin, end, first)
 
     @ti.func
-    def average_shown(self, at: ti.template()):
+    def average_for_frame(self, at: ti.template()):
         """Average the volumes of the g-th group for a frame."""
         if at.region == 0:
             first = at.w * ti.static(self.device.capacity[at.g])
             average_for_frame(at.grid, at.g, at.group, first, first + at.run.particles[at.g])
 
     @ti.func
-    def show(self, at: ti.template()):
+    def write_frame(self, at: ti.template()):
         """Write the frame data of particles of the g-th group."""
         first, after = self.places.particles_of(at.g, at.w, at.region, at.run.particles[at.g])
         if ti.static(self.device.comes_and_goes):
@@ -596,10 +596,10 @@ class CpuPhases(RunPhases):
             first, after = self.places.even_part(at.run.capacity[at.g], at.region)
             first += at.w * ti.static(self.device.capacity[at.g])
             after += at.w * ti.static(self.device.capacity[at.g])
-        first, after = self.share(first, after, at.part)
+        first, after = self.range_of_part(first, after, at.part)
         scratch, capacity = ti.static((self.device.orders[at.g].buffers, self.device.capacity[at.g]))
         offset = scratch_offset(scratch, at.g, at.w, capacity)
-        show_range(
+        write_range(
             at.group,
             first,
             after - first,

@@ -97,7 +97,7 @@ class CpuThreads:
         return claimed >> BITS == self.words[word + NUMBER] and (claimed & MASK) < parts
 
     @ti.func
-    def help(
+    def process_part(
         self, w: int, t: int, idle: int, numbers: ti.template(), counts: ti.template(), frame_buffer: ti.template()
     ):
         """Process one part of the published phase in thread t, if any is left.

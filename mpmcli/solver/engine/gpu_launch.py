@@ -24,7 +24,7 @@ from mpmcli.solver.engine.run_state import ATTEND, GOING, MEASURE, Layout, RunSt
 from mpmcli.solver.engine.step import sorted_fields
 from mpmcli.solver.engine.step_size import StepSize
 from mpmcli.solver.frames.columns import FrameColumns
-from mpmcli.solver.frames.reader import chosen_columns, show_range
+from mpmcli.solver.frames.reader import chosen_columns, write_range
 from mpmcli.solver.grid.grid import box_of
 from mpmcli.solver.machine.maxima import Maxima
 from mpmcli.solver.particles.sort import SPAN, keep, take
@@ -690,7 +690,7 @@ class GpuLaunch:
         group = self.device.groups[g]
 
         @ti.kernel
-        def show(
+        def write_frame(
             run: int,
             first: int,
             count: int,
@@ -704,9 +704,9 @@ class GpuLaunch:
             for chunk in range((count + LANES - 1) // LANES):
                 begin, own = first + chunk * LANES, ti.min(LANES, count - chunk * LANES)
                 (seen,) = ti.static((group.seen_from(run),))
-                show_range(seen, begin, own, dt, 0, affine, gradient, tau, activity, frame_buffer, None, 0)
+                write_range(seen, begin, own, dt, 0, affine, gradient, tau, activity, frame_buffer, None, 0)
 
-        return show
+        return write_frame
 
     def read(
         self, g: int, run: int, first: int, count: int, dt: float, columns: FrameColumns, frame_buffer: np.ndarray

@@ -5,7 +5,7 @@
     choose the step                                       step_size.StepSize.begin
     carry out its phases, see `step_phases`               cpu_phases.CpuPhases, gpu_launch.GpuPhases
     update time, drift and bounds on the next step        step_size.StepSize.end
-    show the particles at an output time                  frames.reader
+    write the particles at an output time                 frames.reader
     measure the state if its bounds may have changed      step_size.StepControl
 
 `cpu_launch.CpuLaunch.advance_run` does this inside one launch until the host is needed. `gpu_launch.GpuLaunch.step`

@@ -45,7 +45,7 @@ def is_there(field: object) -> bool:
 
 
 @ti.func
-def show_range(
+def write_range(
     group: ti.template(),
     first: int,
     count: int,
@@ -160,7 +160,7 @@ def sum_entries(dimension: int) -> int:
 
 @ti.func
 def sum_range(group: ti.template(), first: int, count: int, energies: ti.template(), offset: int):
-    """Return float64 sums over some particles in fixed order, see `sums_of`; for `energies` see `show_range`."""
+    """Return float64 sums over some particles in fixed order, see `sums_of`; for `energies` see `write_range`."""
     d = ti.static(group.dimension)
     pairs = ti.static(axis_pairs(group.dimension))
     turns = ti.static(len(axis_pairs(group.dimension)))
