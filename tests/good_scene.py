@@ -1,6 +1,8 @@
 """A scene that loads, to be damaged by the tests, and what loading it says."""
 
+from contextlib import chdir
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
 
@@ -32,9 +34,10 @@ youngs_modulus = 1e5
 
 
 def load(text: str, *overrides: str) -> LoadedScene:
-    """Load a file scene.toml of the present directory that holds the text."""
-    Path("scene.toml").write_text(text, encoding="utf-8")
-    return load_scene("scene.toml", overrides, laws=parameter_models())
+    """Load a file scene.toml, alone in its directory, that holds the text."""
+    with TemporaryDirectory() as place, chdir(place):
+        Path("scene.toml").write_text(text, encoding="utf-8")
+        return load_scene("scene.toml", overrides, laws=parameter_models())
 
 
 def refusal(text: str, *overrides: str) -> list[str]:

@@ -1,7 +1,5 @@
 """The table of what kernels cost: every law is in it, costs add up, and the cheaper kernels are taken."""
 
-from pathlib import Path
-
 import pytest
 from good_scene import GOOD, load
 from solver_state import scene_of
@@ -54,8 +52,7 @@ def test_a_step_costs_as_many_particles_as_there_are(d: int) -> None:
     assert max(one.compile, sand.compile) < both.compile < one.compile + sand.compile
 
 
-def test_what_stands_beside_costs_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_what_stands_beside_costs_more() -> None:
     alike = GOOD + '[contact]\ndefault = "stick"\n'
     plain = cost_of(load(alike).scene, "most")
     for text in (alike + JET, alike + POST, alike + POST + "density = 1000.0\n"):

@@ -143,8 +143,7 @@ def test_a_total_is_kept_to_a_particle_and_of_a_lattice_as_far_as_whole_sheets_a
         assert sheets.particles == len(sheets.places(scene.emitters[0])) == count
 
 
-def test_the_effective_scene_has_them_all(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_the_effective_scene_has_them_all():
     text = GOOD.replace("[time]", 'walls = { x_max = "open" }\n[time]') + GOOD_JET + GOOD_PUSH
     loaded = load(text)
     again = load(scene_to_toml(loaded.scene)).scene
@@ -191,8 +190,7 @@ BAD = [
 
 
 @pytest.mark.parametrize(("good", "bad", "line"), BAD, ids=[line.split(":", 1)[0] for *_, line in BAD])
-def test_each_bad_one_has_its_sentence(tmp_path, monkeypatch, good, bad, line):
-    monkeypatch.chdir(tmp_path)
+def test_each_bad_one_has_its_sentence(good, bad, line):
     text = GOOD + GOOD_JET + GOOD_PUSH
     assert good in text
     found = refusal(text.replace(good, bad))

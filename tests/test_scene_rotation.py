@@ -13,13 +13,6 @@ from mpmcli.scene.primitives import Solid
 from mpmcli.scene.primitives import rotation as rotation_about
 from mpmcli.scene.surface import form_surface
 
-
-@pytest.fixture(autouse=True)
-def _away_from_the_checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let `refusal` write its scene elsewhere."""
-    monkeypatch.chdir(tmp_path)
-
-
 TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
 BALL_2D, BALL_3D = ({"ball": {"center": [0.3] * d, "radius": 0.15}} for d in (2, 3))
 SHAPES = {
