@@ -186,12 +186,12 @@ class GpuPhases(RunPhases):
     def scatter(self, at: ti.template()):
         """Scatter a particle."""
         layer = at.group.layer_of(at.q)
-        (particles,) = ti.static((self.beside(at, layer),))
+        (particles,) = ti.static((self.particles_in(at, layer),))
         particles.scatter(at.g, at.group, at.q, at.step.kick, at.step.relaxed)
 
-    def beside(self, at: Item, layer: object) -> ParticleUpdate:
+    def particles_in(self, at: Item, layer: object) -> ParticleUpdate:
         """Return the particle update with the nodes of a layer, which is a variable of a kernel."""
-        return at.particles if at.grid.layers == 1 else at.particles.beside(at.grid.in_layer(layer, None))
+        return at.particles if at.grid.layers == 1 else at.particles.with_nodes(at.grid.in_layer(layer, None))
 
     @ti.func
     def to_float(self, at: ti.template()):
@@ -245,7 +245,7 @@ class GpuPhases(RunPhases):
     def advance(self, at: ti.template()):
         """Gather and move a particle."""
         layer = at.group.layer_of(at.q)
-        (particles,) = ti.static((self.beside(at, layer),))
+        (particles,) = ti.static((self.particles_in(at, layer),))
         rate = particles.advance(at.g, self.device.groups[at.g], at.q, at.step.dt, self.gravity_of(at.step))
         self.peaks.include(at.w, 1 + 2 * at.g, rate)
 

@@ -362,7 +362,7 @@ def scatter_tiles(at: ti.template(), first: int, after: int, kick: float, relaxe
         if begin < end:
             place = at.grid.tile_place(at.grid.tile_at[tile])
             first_node = window.first_of(at.t, place)
-            (near,) = ti.static((at.particles.beside(window.seen_from(at.grid, first_node)),))
+            (near,) = ti.static((at.particles.with_nodes(window.seen_from(at.grid, first_node)),))
             window.clear(at.t, relaxed)
             scatter_range(near, at.g, at.group, begin, end, kick, relaxed)
             window.add(at.grid, at.t, place, relaxed)
@@ -378,7 +378,7 @@ def advance_tiles(at: ti.template(), first: int, after: int, dt: float, gravity_
         if begin < end:
             place = at.grid.tile_place(at.grid.tile_at[tile])
             first_node = window.first_of(at.t, place)
-            (near,) = ti.static((at.particles.beside(window.seen_from(at.grid, first_node)),))
+            (near,) = ti.static((at.particles.with_nodes(window.seen_from(at.grid, first_node)),))
             window.load(at.grid, at.t, place)
             sharpest = ti.max(sharpest, advance_range(near, at.g, at.group, begin, end, dt, gravity_step))
     return sharpest

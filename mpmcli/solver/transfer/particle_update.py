@@ -102,7 +102,7 @@ class ParticleUpdate:
         """Reset the records of lost particles of some groups."""
         self._rows.write(first, [NOT_LOST] * count)
 
-    def beside(self, nodes: LinearNodes) -> "ParticleUpdate":
+    def with_nodes(self, nodes: LinearNodes) -> "ParticleUpdate":
         """Return an update whose stencils address these nodes."""
         result = copy(self)
         result.near = nodes
