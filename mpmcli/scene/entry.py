@@ -98,12 +98,10 @@ def speed_of(dimension: int) -> ast.expr:
 
 
 OfTime = entry_of("t")
-OfPlace = entry_of("t", *POSITION, *INITIAL)
 OfMotion = entry_of("t", *POSITION, *INITIAL, *VELOCITY)
 OfStart = entry_of(*INITIAL)
 
 TimeVector = list_of_axes(OfTime, zeros=True)
-PlaceVector = list_of_axes(OfPlace)
 MotionVector = list_of_axes(OfMotion)
 StartVector = list_of_axes(OfStart, zeros=True)
 StartMatrix = list_of_axes(list_of_axes(OfStart))

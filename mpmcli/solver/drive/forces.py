@@ -46,12 +46,6 @@ def forces_on(scene: Scene, names: Sequence[str]) -> tuple[Force, ...]:
     return tuple(force for force in scene.pushes if force.body is None or force.body in names)
 
 
-def needs_initial(scene: Scene, names: Sequence[str]) -> bool:
-    """Return whether any force on these bodies depends on the initial position."""
-    trees = [tree_of(entry) for force in forces_on(scene, names) for entry in force.acceleration]
-    return any(names_in(tree) & set(INITIAL) for tree in trees)
-
-
 @dataclass(frozen=True)
 class Term:
     """A force on one body of a group.
