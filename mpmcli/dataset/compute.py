@@ -29,6 +29,7 @@ from mpmcli.errors import InputError, RunError
 from mpmcli.extras import imported
 from mpmcli.materials.registry import load_plugins
 from mpmcli.output.checksums import path_digest
+from mpmcli.output.durable import writing
 from mpmcli.processes.pool import SPAWN, follow_parent, interrupts_blocked, sharing_cores, silence
 from mpmcli.scene import LoadedScene, Scene, scene_to_toml
 from mpmcli.simulation.engine import Arch
@@ -196,11 +197,8 @@ def _stored(task: Task, row: Row, drawn: Draw, scene: Scene, run: Recording, ret
         folder = PENDING if accepted else QUARANTINE
         path = task.directory / folder / file_name(row.number)
         path.parent.mkdir(parents=True, exist_ok=True)
-        try:
+        with writing(f"trajectory {row.number}", to=path, faults=(RuntimeError,)):
             checksum = write_single(path, trajectory_data(drawn, run), compress=scene.output.compress)
-        except (OSError, RuntimeError) as error:
-            reason = getattr(error, "strerror", None) or error
-            raise RunError(f"trajectory {row.number} could not be written to {path} ({reason}).") from error
         file = f"{folder}/{path.name}"
     facts = {name: getattr(run, name) for name in ("verdict", "reason", "steps", "particles")}
     facts |= {"arch": backend["arch"], "precision": backend["precision"], "file": file, "checksum": checksum}

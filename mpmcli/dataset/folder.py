@@ -26,7 +26,7 @@ from mpmcli.dataset.sweep import Sweep
 from mpmcli.errors import InputError, RunError
 from mpmcli.output.checksums import first_line, path_digest, require_format
 from mpmcli.output.directory import check_directory
-from mpmcli.output.durable import TEMPORARY_SUFFIX, require_free_space, sealed
+from mpmcli.output.durable import TEMPORARY_SUFFIX, require_free_space, sealed, writing
 from mpmcli.output.lock import LOCK
 from mpmcli.scene.toml_file import key_parts
 
@@ -230,16 +230,12 @@ class Folder:
         kept = f"its trajectories are kept in {self.path / PENDING}"
         target.parent.mkdir(exist_ok=True)
         require_free_space(target.parent, size, f"shard {shard}", kept)
-        try:
-            with sealed(target, size) as temporary:
-                join_trajectories(files, temporary)
-                with h5py.File(temporary, "r") as joined:
-                    damaged = [r.number for r in accepted if checksum(joined[group_name(r.number)]) != r.checksum]
-                if damaged:
-                    raise RunError(f"{target} does not hold trajectory {damaged[0]} as it was computed; {kept}.")
-        except (OSError, RuntimeError, KeyError) as error:
-            reason = getattr(error, "strerror", None) or error
-            raise RunError(f"{target} could not be written ({reason}); {kept}.") from error
+        with writing(target, kept, faults=(RuntimeError, KeyError)), sealed(target, size) as temporary:
+            join_trajectories(files, temporary)
+            with h5py.File(temporary, "r") as joined:
+                damaged = [r.number for r in accepted if checksum(joined[group_name(r.number)]) != r.checksum]
+            if damaged:
+                raise RunError(f"{target} does not hold trajectory {damaged[0]} as it was computed; {kept}.")
         return [replace(row, file=self.shard_file(shard)) for row in accepted]
 
 

@@ -16,8 +16,8 @@ from mpmcli.dataset.folder import (
 )
 from mpmcli.dataset.report import CARD, Status, status_of, verify, write_card
 from mpmcli.dataset.shard import BASE, QUARANTINE, SHARDS, SWEEP
-from mpmcli.errors import InputError, RunError
-from mpmcli.output.durable import require_free_space, sealed, write_text
+from mpmcli.errors import InputError
+from mpmcli.output.durable import require_free_space, sealed, write_text, writing
 from mpmcli.output.lock import take_lock
 
 
@@ -65,7 +65,7 @@ def merge(parts: Sequence[Path], target: Path) -> Status:
         if not manifest.path.exists():
             manifest.create(told)
         manifest.put(rows)
-        try:
+        with writing(target, "the parts are kept"):
             for file in files:
                 copy = target / file.parent.name / file.name
                 copy.parent.mkdir(exist_ok=True)
@@ -74,8 +74,6 @@ def merge(parts: Sequence[Path], target: Path) -> Status:
             for name in (SWEEP, BASE):
                 write_text(target / name, (parts[0] / name).read_text(encoding="utf-8"))
             copy_sources(facts[0].get("files", ()), parts[0], target)
-        except OSError as error:
-            raise RunError(f"{target} could not be written ({error.strerror}); the parts are kept.") from error
         write_card(target)
     return status_of(target)
 

@@ -31,9 +31,9 @@ from mpmcli.dataset.shard import (
     moving_names,
     open_shard,
 )
-from mpmcli.errors import InputError, RunError
+from mpmcli.errors import InputError
 from mpmcli.output.checksums import checksum_is_right
-from mpmcli.output.durable import sealed, write_text
+from mpmcli.output.durable import sealed, write_text, writing
 from mpmcli.plain_text import counted, markdown_table, one_line, size_text
 from mpmcli.render.picture_file import digest_of
 
@@ -258,13 +258,11 @@ def write_card(directory: Path) -> Path:
         f"Drawn with seed {facts['seed']}; computed with mpmcli {facts['version']}. `sweep.toml` and `base.toml` are "
         "the sweep and its base scene.",
     ]
-    try:
+    with writing(directory / CARD, "the dataset is kept"):
         for name, text in tables.items():
             write_text(directory / name, text)
         card = "\n\n".join(section for section in sections if section)
         _put_card(directory / CARD, card.encode(), _front_matter(tables).encode())
-    except OSError as error:
-        raise RunError(f"{directory / CARD} could not be written ({error.strerror}); the dataset is kept.") from error
     return directory / CARD
 
 

@@ -11,8 +11,8 @@ import numpy as np
 from mpmcli.error_bars.bars import BARS, Bars, distance
 from mpmcli.error_bars.observables import DENSITY
 from mpmcli.error_bars.study import Study
-from mpmcli.errors import InputError, RunError
-from mpmcli.output.durable import sealed, write_text
+from mpmcli.errors import InputError
+from mpmcli.output.durable import sealed, write_text, writing
 from mpmcli.plain_json import finite_json
 from mpmcli.plain_text import counted, duration_text, markdown_table, plain_number, text_table
 from mpmcli.plot.style import LIGHT_SERIES, THEMES, drawing
@@ -181,15 +181,13 @@ def write(study: Study, directory: Path) -> None:
         markdown_table(RUNS, cost_rows(study), {0, 1}),
         f"![Seconds against error]({COST})",
     ]
-    try:
+    with writing("The report", to=directory):
         directory.mkdir(parents=True, exist_ok=True)
         for name, content in ((BANDS, draw_bands(study)), (COST, draw_cost(study))):
             with sealed(directory / name, unique=True) as temporary:
                 temporary.write_bytes(content)
         write_text(directory / BARS, json.dumps(as_dict(study)) + "\n", unique=True)
         write_text(directory / PAGE, "\n\n".join(page) + "\n", unique=True)
-    except OSError as error:
-        raise RunError(f"The report could not be written to {directory} ({error.strerror or error}).") from error
 
 
 def draw_bands(study: Study) -> bytes:

@@ -17,7 +17,7 @@ from mpmcli.error_bars.siblings import CAUSES, LEVELS, Cause, LeftOut, Level, Re
 from mpmcli.errors import InputError, MpmcliError, RunError
 from mpmcli.materials.registry import laws as known_laws
 from mpmcli.materials.registry import parameter_models
-from mpmcli.output.durable import sealed
+from mpmcli.output.durable import sealed, writing
 from mpmcli.output.result import Result
 from mpmcli.scene import LoadedScene, Scene, parse_scene, sample_bodies
 from mpmcli.scene.expression import Expression
@@ -223,22 +223,17 @@ class _Kept:
         """Write the series, if there is a directory. Raises RunError on failure."""
         if self._path is None:
             return
-        try:
-            self._write(series)
-        except OSError as error:
-            raise RunError(f"{self._path} could not be written ({error.strerror or error}).") from error
-
-    def _write(self, series: Series) -> None:
-        self._path.parent.mkdir(parents=True, exist_ok=True)
         names, rows = list(series.values), np.array(list(series.values.values()))
         reach = np.array([series.reach.low, series.reach.high, series.reach.middle])
         facts = {name: getattr(series, name) for name in self.FACTS}
-        with sealed(self._path, unique=True) as temporary, temporary.open("wb") as file:
-            np.savez_compressed(
-                file,
-                **{name: getattr(series, name) for name in self.ARRAYS},
-                values=rows,
-                reach=reach,
-                names=json.dumps(names),
-                facts=json.dumps(facts),
-            )
+        with writing(self._path):
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            with sealed(self._path, unique=True) as temporary, temporary.open("wb") as file:
+                np.savez_compressed(
+                    file,
+                    **{name: getattr(series, name) for name in self.ARRAYS},
+                    values=rows,
+                    reach=reach,
+                    names=json.dumps(names),
+                    facts=json.dumps(facts),
+                )

@@ -16,10 +16,9 @@ from typing import Any, Protocol
 import h5py
 import numpy as np
 
-from mpmcli.errors import RunError
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.checksums import append_checksum, load_checksums, store_checksums, table_checksum
-from mpmcli.output.durable import require_free_space, sealed, write_text
+from mpmcli.output.durable import require_free_space, sealed, write_text, writing
 from mpmcli.output.vtkhdf import FORMAT, LIBVER, open_vtkhdf
 from mpmcli.scene.colliders import Collider
 from mpmcli.scene.mesh import ClosedSurface
@@ -167,17 +166,11 @@ def _groups(header: Mapping[str, Any], colliders: Sequence[Collider]) -> Iterato
 @contextmanager
 def _written(directory: Path, name: str, size: int) -> Iterator[Path]:
     """Yield a temporary path for a file of `size` bytes; RunError: the disk is full or a write failed."""
-    path = directory / name
-    kept = "the frames of the run are kept"
-    try:
+    path, kept = directory / name, "the frames of the run are kept"
+    with writing(path, kept, faults=(RuntimeError,)):
         require_free_space(directory, size, f"writing {name}", kept)
         with sealed(path, size) as temporary:
             yield temporary
-    except (OSError, RuntimeError) as error:
-        if isinstance(error, RunError):
-            raise
-        reason = getattr(error, "strerror", None) or error
-        raise RunError(f"{path} could not be written ({reason}); {kept}.") from error
 
 
 def _write_vtkhdf(path: Path, group: ColliderGroup, times: Sequence[float]) -> None:

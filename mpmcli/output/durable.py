@@ -9,7 +9,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from secrets import token_hex
 
-from mpmcli.errors import DiskFullError
+from mpmcli.errors import DiskFullError, RunError
 
 try:
     import resource
@@ -115,6 +115,16 @@ def write_text(path: Path, text: str, *, unique: bool = False) -> None:
     """Replace a UTF-8 text file in one durable step; see `sealed`."""
     with sealed(path, unique=unique) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="\n")
+
+
+@contextmanager
+def writing(what: object, kept: str = "", *, to: Path | None = None, faults: tuple = ()) -> Iterator[None]:
+    """Raise a RunError for an OSError, or one of `faults`, in what is written here; `kept` ends its sentence."""
+    try:
+        yield
+    except (OSError, *faults) as error:
+        where, reason = f" to {to}" if to else "", getattr(error, "strerror", None) or error
+        raise RunError(f"{what} could not be written{where} ({reason}){kept and f'; {kept}'}.") from error
 
 
 def number_of(path: Path) -> int:

@@ -12,9 +12,8 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from mpmcli import __version__
-from mpmcli.errors import RunError
 from mpmcli.frames.ledger import LedgerRow
-from mpmcli.output.durable import write_text
+from mpmcli.output.durable import write_text, writing
 from mpmcli.output.lock import Owner, lock_is_held, time_now
 from mpmcli.plain_json import finite_json
 
@@ -115,10 +114,8 @@ class RunRecord:
         content = {"program": PROGRAM, "version": __version__, **facts}
         content |= {"process": asdict(Owner.here()), "host": host}
         text = json.dumps(finite_json(content), indent=2, ensure_ascii=False, default=_plain)
-        try:
+        with writing(RECORD, to=self.directory):
             write_text(Path(self.directory) / RECORD, text + "\n")
-        except OSError as error:
-            raise RunError(f"{RECORD} could not be written to {self.directory} ({error.strerror or error}).") from error
 
 
 class _StoredRecord(BaseModel):

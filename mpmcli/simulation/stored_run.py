@@ -16,7 +16,7 @@ from mpmcli.materials.registry import laws
 from mpmcli.output import RunRecord, open_result
 from mpmcli.output.checkpoints import Checkpoint, write_checkpoint
 from mpmcli.output.directory import SCENE, TakenDirectory
-from mpmcli.output.durable import write_text
+from mpmcli.output.durable import write_text, writing
 from mpmcli.output.header import RunHeader
 from mpmcli.output.layout import DAMAGED, sealed_segments
 from mpmcli.output.series import SERIES, write_series
@@ -173,11 +173,8 @@ class StoredRun:
 
     def _write_scene(self) -> None:
         """Write the effective scene; RunError: the disk is full or a write failed."""
-        path = self._directory / SCENE
-        try:
-            write_text(path, self._text)
-        except OSError as error:
-            raise RunError(f"{path} could not be written ({error.strerror or error}).") from error
+        with writing(self._directory / SCENE):
+            write_text(self._directory / SCENE, self._text)
 
     def _compute(self, run: Run, checkpoints: "Checkpointer") -> None:
         """Compute and store each frame; the record and the summary count only sealed frames."""

@@ -8,8 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mpmcli.errors import RunError
-from mpmcli.output.durable import sealed, write_text
+from mpmcli.output.durable import sealed, write_text, writing
 from mpmcli.plain_text import counted, markdown_table, text_table
 from mpmcli.plot.style import LIGHT_SERIES, empty_figure
 from mpmcli.validation.case import KNOBS, Case, Level, Setting
@@ -196,14 +195,12 @@ class Report:
 
 def write_report(report: Report, directory: Path) -> None:
     """Write the page and its figures into an existing directory, each file atomically. Raises RunError on failure."""
-    try:
+    with writing("The report", to=directory):
         (directory / FIGURES).mkdir(exist_ok=True)
         for entry in report.case_reports:
             with sealed(directory / FIGURES / f"{entry.case.name}.svg", unique=True) as temporary:
                 temporary.write_bytes(draw_case(entry.case, entry.results))
         write_text(directory / PAGE, report.page())
-    except OSError as error:
-        raise RunError(f"The report could not be written to {directory} ({error.strerror or error}).") from error
 
 
 def _ratios(pairs: Iterable[tuple[float, float]], least: float) -> str:

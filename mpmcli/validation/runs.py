@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Literal
 
 from mpmcli.bench.report import describe_machine
-from mpmcli.errors import InputError, MpmcliError, RunError
+from mpmcli.errors import InputError, MpmcliError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.materials.registry import parameter_models
 from mpmcli.output.directory import check_directory
-from mpmcli.output.durable import write_text
+from mpmcli.output.durable import write_text, writing
 from mpmcli.processes.pool import Fault, in_processes
 from mpmcli.scene import Scene, parse_scene
 from mpmcli.solver.engine.run import Run as SolverRun
@@ -203,10 +203,8 @@ class Journal:
     def keep(self, run: Run, result: RunResult) -> None:
         """Store the result of a run. Raises RunError if the file cannot be written."""
         self._kept[run_key(run)] = asdict(result)
-        try:
+        with writing(self._file):
             write_text(self._file, json.dumps(self._kept, indent=1) + "\n")
-        except OSError as error:
-            raise RunError(f"{self._file} could not be written ({error.strerror or error}).") from error
 
 
 def run_key(run: Run) -> str:
