@@ -38,7 +38,7 @@ from mpmcli.materials.registry import parameter_models
 from mpmcli.output import open_result
 from mpmcli.output.lock import take_lock
 from mpmcli.scene.schema import Time
-from mpmcli.simulation.runner import Recording, record
+from mpmcli.simulation.runner import Recording, Runner
 
 # A law that is stable by its own word, and in truth is not: its pressure pulls.
 WRONG_LAW = LAW.replace("spherical = constants[0]", "spherical = -constants[0]")
@@ -360,16 +360,16 @@ def test_a_bad_trajectory_is_tried_again_and_then_left_out(tmp_path: Path) -> No
 def test_a_fault_in_one_trajectory_does_not_end_the_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It gets a row that says so, and the next ones are computed."""
 
-    calls = []
+    calls, run = [], Runner.run
 
     def faulty(*arguments: object) -> Recording:
         calls.append(arguments)
         if len(calls) == 2:
             raise ZeroDivisionError("division by zero")
-        return record(*arguments)
+        return run(*arguments)
 
     sweep = tiny_sweep(tmp_path, 3)
-    monkeypatch.setattr("mpmcli.simulation.runner.record", faulty)
+    monkeypatch.setattr(Runner, "run", faulty)
     first, second, third = compute(Task(tmp_path / "dataset", sweep, (0, 1, 2)))
     assert (second.number, second.verdict, second.accepted) == (1, "failed", 0)
     assert second.reason == "ZeroDivisionError: division by zero (a fault of mpmcli)."

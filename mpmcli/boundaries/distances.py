@@ -12,6 +12,7 @@ from mpmcli.quick_taichi import ti
 from mpmcli.scene.colliders import Plane
 from mpmcli.scene.primitives import Ball, Box, Capsule, Cylinder, Polygon
 from mpmcli.scene.shapes import Form, distance_grid
+from mpmcli.scene.surface import ring
 
 # Vectors shorter than this have no direction.
 TINY = 1e-12
@@ -188,10 +189,7 @@ class PolygonDistance(Distance):
     """A polygon: the number of its vertices, and their coordinates, counterclockwise."""
 
     def numbers(self, form: Polygon, pivot: np.ndarray) -> list[float]:
-        vertices = np.array(form.vertices) - pivot
-        x, y = vertices.T
-        if np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y) < 0:
-            vertices = vertices[::-1]
+        vertices = ring(np.array(form.vertices) - pivot).points
         return [float(len(vertices)), *vertices.ravel()]
 
     @ti.func

@@ -108,7 +108,7 @@ def check_scene(
     directory: Path = Path(),
     threads: int | None = None,
 ) -> SceneCheck:
-    """Check a scene, without Taichi; the plan is by default for all cores, the probe measures the cost of a step.
+    """Check a scene, without Taichi; the plan is by default that of the CPU, the probe measures the cost of a step.
 
     `directory` is the place of results, `threads` those of the run: None for as many as the scene can use.
     InputError: no step is stable, or more than MOST_STEPS are needed.
@@ -122,7 +122,8 @@ def check_scene(
             f"{scene.time.end:.3g} s. {facts.binding.why}"
         )
     if plan is None:
-        plan = make_plan(scene, Backend("cpu", available_cores(), scene.solver.precision, compile_cache=True))
+        cores = threads or available_cores()
+        plan = make_plan(scene, Backend("cpu", cores, scene.solver.precision, compile_cache=True))
     threads = threads or useful_threads(plan.particles, available_cores())
     forecast = forecast_of(facts, plan, probe, threads)
     rules = (step_findings, shape_findings, material_findings, drive_findings, loss_findings, rounding_findings)

@@ -33,15 +33,11 @@ def check_command(
     """
     if path.suffix == ".toml":
         from mpmcli.check.scene_check import check_scene
-        from mpmcli.cores import available_cores
         from mpmcli.materials.registry import load_plugins
         from mpmcli.scene import load_scene
-        from mpmcli.solver.engine.plan import make_plan
-        from mpmcli.solver.machine.backend import Backend
 
         loaded = load_scene(path, overrides, laws=load_plugins(plugins))
-        backend = Backend("cpu", threads or available_cores(), loaded.scene.solver.precision, compile_cache=True)
-        check = check_scene(loaded, plan=make_plan(loaded.scene, backend), threads=threads)
+        check = check_scene(loaded, threads=threads)
         # Do not run a scene that does not fit into memory.
         if probe and not any(finding.rule == "memory" for finding in check.findings):
             from mpmcli.check.forecast import probe_scene

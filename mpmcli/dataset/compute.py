@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 from functools import cache, partial
 from multiprocessing import connection
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
@@ -223,18 +222,8 @@ def trajectory_data(drawn: Draw, run: Recording) -> TrajectoryData:
     )
 
 
-class Workers(Protocol):
-    """Workers that compute tasks, from `local_workers` or `joined_workers`; `count` of them."""
-
-    count: int
-
-    def outcomes(self, tasks: Iterable[Task], stop: Callable[[], bool]) -> Iterator[tuple[Task, list[Row] | None]]:
-        """Yield each task with its rows as it ends, None if no worker survived; RunError: write or cluster failed."""
-        ...
-
-
 class LocalWorkers:
-    """Processes of this machine that compute one task after another, over pipes that no other process can open."""
+    """Processes of this machine, `count`, that compute tasks in turn, over pipes that no other process can open."""
 
     def __init__(self, count: int) -> None:
         self.count = count
@@ -255,7 +244,10 @@ class LocalWorkers:
         return ours
 
     def outcomes(self, tasks: Iterable[Task], stop: Callable[[], bool]) -> Iterator[tuple[Task, list[Row] | None]]:
-        """Implement `Workers.outcomes`; a task whose worker is killed is tried again, its trajectories one by one."""
+        """Yield each task with its rows as it ends, None if no worker survived; RunError: a write failed.
+
+        A task whose worker is killed is tried again, its trajectories one by one.
+        """
         waiting, lost = deque(tasks), Counter[tuple[int, ...]]()
         idle, under_way = list(self._processes), {}
 
@@ -344,7 +336,7 @@ class ClusterWorkers:
         self.count = len(client.scheduler_info(n_workers=-1)["workers"])
 
     def outcomes(self, tasks: Iterable[Task], stop: Callable[[], bool]) -> Iterator[tuple[Task, list[Row] | None]]:
-        """Implement `Workers.outcomes`."""
+        """Yield each task as `LocalWorkers.outcomes` does; RunError: the cluster has ended."""
         from distributed import Future
         from distributed.scheduler import KilledWorker
 
@@ -383,6 +375,9 @@ class ClusterWorkers:
                 yield from self.outcomes([replace(task, numbers=(number,)) for number in task.numbers], stop)
             else:
                 yield task, None
+
+
+Workers = LocalWorkers | ClusterWorkers
 
 
 @contextmanager

@@ -78,23 +78,6 @@ class Recorder:
         return Recording(self._header, self._frames, self._ledger, *counts, verdict, reason, seconds)
 
 
-def record(
-    run: Run,
-    scene: Scene,
-    backend: Backend,
-    stop: Callable[[], bool] = lambda: False,
-    observe: Observe | None = None,
-) -> Recording:
-    """Run a scene until it ends or stops; KeyboardInterrupt: `stop` returned True."""
-    recorder = Recorder(run, scene, backend, observe)
-    try:
-        for frame, row in run.frames(stop):
-            recorder.take(frame, row)
-    except UnstableRunError as error:
-        return recorder.stopped(error)
-    return recorder.finished()
-
-
 # Largest number of kinds with kept kernels, and largest number of particles of a scene that uses kept kernels.
 MOST_KINDS, FEW_PARTICLES = 8, 20_000
 # Runs that advance together on a GPU.
@@ -166,7 +149,13 @@ class Runner:
             require_memory(make_plan(scene, backend))
             self._restart(backend)
             run = build_run(scene, backend, particles)
-        return record(run, scene, backend, stop, observe)
+        recorder = Recorder(run, scene, backend, observe)
+        try:
+            for frame, row in run.frames(stop):
+                recorder.take(frame, row)
+        except UnstableRunError as error:
+            return recorder.stopped(error)
+        return recorder.finished()
 
     def run_all(self, scenes: Sequence[Scene]) -> Iterator[tuple[int, Recording | Exception]]:
         """Yield the index of each scene with its recording or error, as they end; small ones run together on a GPU."""
