@@ -152,9 +152,8 @@ def _study_of(path: Path, output: Path | None, asked: dict[str, Any]) -> tuple["
             raise InputError(f"--set changes scenes, and {path} is not one; leave it out.")
         if result.status != "finished":
             raise InputError(f'{path} is of a run that is "{result.status}": error bars need all its frames.')
-        directory = result.path if result.path.is_dir() else result.path.parent
-        loaded = load_scene(directory / SCENE, laws=laws)
-        output = output or directory / ERROR_BARS
+        loaded = load_scene(result.directory / SCENE, laws=laws)
+        output = output or result.directory / ERROR_BARS
         plan = plan_for(loaded, output, asked)
         if asked["budget"]:
             seconds = float((result.record or {}).get("timings", {}).get("solve_s", 0.0))

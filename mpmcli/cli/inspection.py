@@ -136,7 +136,7 @@ def _result_facts(path: Path) -> dict:
     from mpmcli.output import open_result
 
     result = open_result(path)
-    bars = read_bars(result.path, result.times) or {}
+    bars = read_bars(result.directory, result.times) or {}
     header, record, ledger = result.header, result.record or {}, result.ledger
     return {
         "title": header.title,

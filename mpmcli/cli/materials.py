@@ -69,15 +69,13 @@ def materials_command(name: str | None, plugins: tuple[Path, ...], as_json: bool
     """
     from mpmcli.materials.registry import laws, load_plugins
     from mpmcli.scene.expand import PRESETS, available_presets, law_facts, preset_facts
-    from mpmcli.scene.problem import listed, nearest, quoted, rigid_hint
+    from mpmcli.scene.problem import hint_at, listed, quoted, rigid_hint
 
     models = load_plugins(plugins)
     known, presets = laws(), available_presets(models)
     if name is not None and name not in known and name not in presets:
-        guess = nearest(name, [*known, *presets])
         there = f"{rigid_hint(name)}there are {listed(quoted([*sorted(known), *presets]), 'and')}"
-        hint = f'did you mean "{guess}"?' if guess else there
-        raise InputError(f'there is no law or preset "{name}"; {hint}')
+        raise InputError(f'there is no law or preset "{name}"; {hint_at(name, [*known, *presets], there)}')
     facts: dict[str, list[dict[str, Any]]] = {
         "laws": [
             {"summary": _summary(known[law]), **law_facts(known[law].parameters)}

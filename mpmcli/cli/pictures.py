@@ -154,7 +154,7 @@ def plot_command(
             f"--size {size} leaves no room for the panels: give a width of one to {WIDEST} times the height."
         )
     opened = open_result(result)
-    path = output or (opened.path if opened.path.is_dir() else opened.path.parent) / LEDGER
+    path = output or opened.directory / LEDGER
     if path.suffix.lower() != ".png":
         raise InputError(f"{path} cannot be a picture of this command: give a name that ends in .png.")
     digest = digest_of(path)

@@ -170,7 +170,7 @@ def _study(
 
 
 def _chosen(names: Sequence[str]) -> list["Case"]:
-    from mpmcli.scene.problem import listed, nearest
+    from mpmcli.scene.problem import hint_at, listed
     from mpmcli.validation.cases import all_cases
 
     known = all_cases()
@@ -178,8 +178,8 @@ def _chosen(names: Sequence[str]) -> list["Case"]:
     for name in names:
         meant = [name] if name in known else [case for case in known if case.startswith(f"{name}_")]
         if not meant:
-            guess = nearest(name, [*known, *dict.fromkeys(case.partition("_")[0] for case in known)])
-            hint = f'did you mean "{guess}"?' if guess else f"there are {listed(list(known), 'and')}."
+            words = [*known, *dict.fromkeys(case.partition("_")[0] for case in known)]
+            hint = hint_at(name, words, f"there are {listed(list(known), 'and')}.")
             raise InputError(f'there is no case "{name}"; {hint}')
         chosen.update(meant)
     return [case for name, case in known.items() if not names or name in chosen]

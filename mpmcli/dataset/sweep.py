@@ -13,7 +13,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field, PlainValidator, model_validator
 
-from mpmcli.scene.problem import listed, nearest, quoted, written
+from mpmcli.scene.problem import hint_at, listed, quoted, written
 from mpmcli.scene.quantity import AXES, LARGEST, Integer, NotNegative, Number, Table, flaw, list_of_axes
 
 # Default bounds of a normal distribution, in standard deviations.
@@ -186,10 +186,8 @@ def _kind(table: dict[str, Any]) -> str:
     for key in table:
         known = ["within"] if found == ["normal"] else [] if found else _KINDS
         if key not in (*found, *known):
-            guess = nearest(key, known)
             takes = f"{found[0]} takes no other key" if found else f"the distributions are {listed(_KINDS, 'and')}"
-            hint = f'did you mean "{guess}"?' if guess else takes
-            raise flaw(f"unknown key; {hint}", key)
+            raise flaw(f"unknown key; {hint_at(key, known, takes)}", key)
     if not found:
         raise flaw(f"must be a distribution, {listed(_KINDS)}, or a value; found an empty table")
     return found[0]

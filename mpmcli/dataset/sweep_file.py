@@ -17,7 +17,7 @@ from mpmcli.scene import Scene, parse_scene
 from mpmcli.scene.load import read_scene, report, scene_problems
 from mpmcli.scene.material import Laws
 from mpmcli.scene.points import absence
-from mpmcli.scene.problem import Path, Problem, listed, nearest, path_text, problems_of, quoted, several, written
+from mpmcli.scene.problem import Path, Problem, hint_at, listed, path_text, problems_of, quoted, several, written
 from mpmcli.scene.quantity import AXES, NUMBER_WORDS, dimension_of
 from mpmcli.scene.shapes import COMBINED
 from mpmcli.scene.toml_file import apply_overrides, key_parts, read_toml, set_value
@@ -93,9 +93,8 @@ def _misplaced(sweep: Sweep) -> Iterator[Problem]:
         there = {entry["name"]: entry for entry in sweep.base_data.get(place.list, [])}
         names = [other.template for other in sweep.placements if other.list == place.list]
         if name not in there:
-            guess = nearest(name, list(there))
             known = f"the {place.list} are {listed(quoted(list(there)), 'and')}" if there else "it has none"
-            hint = f'did you mean "{guess}"?' if guess else known
+            hint = hint_at(name, list(there), known)
             yield Problem((*path, kind), f'no {kind} of the base scene has the name "{name}"; {hint}')
         elif place.key in [other.key for other in sweep.placements[:index]]:
             yield Problem((*path, kind), f'"{name}" is placed already; a template is for one placement')

@@ -104,8 +104,8 @@ class Bars:
 
 
 def read_bars(directory: Path, times: np.ndarray) -> dict[str, Any] | None:
-    """Return the stored study of a result in a directory, or of its file; None without bars at its times."""
-    path = (directory if directory.is_dir() else directory.parent) / ERROR_BARS / BARS
+    """Return the stored study of a result in a directory; None without bars at its times."""
+    path = directory / ERROR_BARS / BARS
     try:
         stored = json.loads(path.read_text(encoding="utf-8"))
         return stored if np.array_equal(stored["time_s"], times) else None

@@ -17,7 +17,7 @@ from mpmcli.plain_json import finite_json
 from mpmcli.plain_text import counted, duration_text, markdown_table, plain_number, text_table
 from mpmcli.plot.style import LIGHT_SERIES, THEMES, drawing
 from mpmcli.scene import Scene
-from mpmcli.scene.problem import listed, nearest
+from mpmcli.scene.problem import hint_at, listed
 from mpmcli.scene.quantity import AXES
 
 PAGE, BANDS, COST = "report.md", "bands.svg", "cost.svg"
@@ -144,8 +144,7 @@ def target_text(study: Study, name: str, share: float) -> str:
     bars, scene = study.bars, study.scene
     name = headline(scene, bars) if name == "front" else name
     if name not in bars.of:
-        guess = nearest(name, list(bars.of))
-        hint = f'did you mean "{guess}"?' if guess else f"there are front, {listed(list(bars.of), 'and')}."
+        hint = hint_at(name, list(bars.of), f"there are front, {listed(list(bars.of), 'and')}.")
         raise InputError(f'--target: there is no observable "{name}"; {hint}')
     wanted, worst = share * bars.of[name].size, float(np.nanmax(bars.of[name].bar))
     finer = worst / wanted

@@ -35,7 +35,7 @@ class Result(ABC):
     No file stays open, so a Result can be copied to other processes.
 
     Attributes:
-        path: the packed file, or the directory of the segments.
+        path: the packed file, or the directory of the segments; directory: that of the result.
         kind: "packed", or "segments" (running, or ended before packing).
         times: (T,) float64, s.
         numbers: (T,) frame numbers.
@@ -67,15 +67,14 @@ class Result(ABC):
         self.dimension = index.layout.dimension
         names = [name for name in index.layout.arrays if name not in (POSITION, *STANDARD)]
         self.field_names: tuple[str, ...] = tuple(names)
-        directory = path if path.is_dir() else path.parent
-        self.record = read_record(directory)
-        self.status = run_status(directory, self.record)
+        self.directory = path if path.is_dir() else path.parent
+        self.record = read_record(self.directory)
+        self.status = run_status(self.directory, self.record)
 
     @cached_property
     def colliders(self) -> tuple[Collider, ...]:
         """The colliders of the scene; one whose mesh is neither found nor stored with the frames is left out."""
-        directory = self.path if self.path.is_dir() else self.path.parent
-        found = self.header.read_colliders(read_stored_surfaces(directory))
+        found = self.header.read_colliders(read_stored_surfaces(self.directory))
         found = as_they_moved(found, self)
         return tuple(collider for collider in found if collider is not None)
 

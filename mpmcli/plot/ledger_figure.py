@@ -90,7 +90,7 @@ def read_history(result: Result) -> History:
     extents = [[_extent(frame, label) for label in labels] for frame in (result.present_frame(k, ()) for k in chosen)]
     both = np.array(extents).reshape(len(chosen), len(labels), 2, result.dimension)
     names = bodies if apart else (bodies[0] if len(bodies) == 1 else "all bodies",)
-    bars = (read_bars(result.path, result.times) or {}).get("observables", {})
+    bars = (read_bars(result.directory, result.times) or {}).get("observables", {})
     return History(
         title=one_line(result.header.title) or result.path.stem,
         header=result.header,

@@ -13,7 +13,7 @@ from mpmcli.output.result import Result
 from mpmcli.render.frame_choice import evenly_spaced
 from mpmcli.render.render_scene import RenderScene
 from mpmcli.render.settings import LIMIT_MAX, LIMIT_MIN, Theme, rgb_bytes
-from mpmcli.scene.problem import listed, nearest
+from mpmcli.scene.problem import hint_at, listed
 from mpmcli.scene.schema import ParticleField
 
 # Values available in every result, and values that need a stored field.
@@ -177,9 +177,8 @@ def _not_stored(name: str, result: Result, field: str) -> InputError:
     storable = get_args(ParticleField)
     if field in storable:
         return InputError(f'{holds}; to store it, add "{field}" to output.fields of the scene and run it again.')
-    guess = nearest(field, [*ALWAYS, *DERIVED, *known, *storable])
-    hint = f'did you mean "{guess}"?' if guess else f"{listed([*ALWAYS, *DERIVED], 'and')} have names of their own."
-    return InputError(f"{holds}; {hint}")
+    named = f"{listed([*ALWAYS, *DERIVED], 'and')} have names of their own."
+    return InputError(f"{holds}; {hint_at(field, [*ALWAYS, *DERIVED, *known, *storable], named)}")
 
 
 def _limits(value: Coloring, result: Result) -> tuple[float, float]:
@@ -211,8 +210,7 @@ def color_map(name: str | None, usual: str = SEQUENTIAL) -> str:
     if name is None:
         return usual
     if name not in mpl.colormaps:
-        guess = nearest(name, list(mpl.colormaps))
-        hint = f'did you mean "{guess}"?' if guess else "viridis, cividis, magma, coolwarm are some."
+        hint = hint_at(name, list(mpl.colormaps), "viridis, cividis, magma, coolwarm are some.")
         raise InputError(f'--cmap "{name}" is not a colour map of matplotlib; {hint}')
     return name
 

@@ -253,7 +253,7 @@ def _paths(result: Result, request: Request, count: int) -> Callable[[int], Path
         if count > 1 and not request.montage:
             raise InputError(f"-o {output} is one picture and {count} were asked for: name a directory.")
         return lambda k: output
-    directory = output or (result.path if result.path.is_dir() else result.path.parent) / DIRECTORY
+    directory = output or result.directory / DIRECTORY
     if request.montage:
         return lambda k: directory / f"{mode}_montage.png"
     if directory.exists() and not directory.is_dir():
