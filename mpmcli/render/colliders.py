@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,6 +12,7 @@ from mpmcli.render.render_scene import RenderScene
 from mpmcli.render.settings import Theme, rgb
 from mpmcli.render.view import Slice, View
 from mpmcli.scene.colliders import Collider, Plane
+from mpmcli.scene.primitives import box_corners
 from mpmcli.scene.surface import Surface, collider_surface, poly_data, surface_of, without_doubles
 
 if TYPE_CHECKING:
@@ -87,7 +87,7 @@ class FlatColliders:
         """Return rows and columns of the picture in which a collider may be visible."""
         if isinstance(collider.form, Plane) or collider.side == "inside":
             return slice(None), slice(None)
-        corners = np.array(list(product(*zip(*collider.form.bounds(), strict=True))))
+        corners = box_corners(*collider.form.bounds())
         ends = np.zeros((len(corners), 3))
         ends[:, : corners.shape[1]] = collider.motion.placed(corners, time)
         pixels = self._view.pixels(ends)[:, :2]

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 
@@ -11,7 +10,7 @@ from mpmcli.scene.entry import Entry, value_of, varies
 from mpmcli.scene.expression import INITIAL, POSITION, VELOCITY, Apply, Expression, Tree, bounds_of, names_in
 from mpmcli.scene.material import SceneBounds
 from mpmcli.scene.points import Points
-from mpmcli.scene.primitives import grid_points
+from mpmcli.scene.primitives import box_corners, grid_points
 from mpmcli.scene.quadrature import parts_of
 from mpmcli.scene.sampling import estimate_body, initial_motion, moves_unevenly, particle_places
 from mpmcli.scene.schema import Body, Emitter, Force, Scene
@@ -218,7 +217,7 @@ def reaching(source: Body | Emitter, scene: Scene) -> list[Body | Emitter]:
         solid = isinstance(other, Body) and other.material.solid
         stands = steady and solid and not (impelled & {None, other.name} or highest_speed(other, scene.time.end) > 0)
         if stands and gravity.any():
-            above = _falls(scene, _corners(*other.shape.form.bounds()), gravity)
+            above = _falls(scene, box_corners(*other.shape.form.bounds()), gravity)
             stands = float(np.min(above)) < scene.domain.spacing
         if other is source or not stands:
             found.append(other)
@@ -258,7 +257,7 @@ def scene_bounds(scene: Scene, sources: Sequence[Body | Emitter] | None = None) 
     closed = ~np.array(scene.domain.periodic)
     # Without material the rigid bodies are what falls.
     forms = [body.shape.form for body in sources] or [one.form for one in scene.colliders if one.free]
-    corners = np.concatenate([_corners(*form.bounds()) for form in forms])
+    corners = np.concatenate([box_corners(*form.bounds()) for form in forms])
     if any((gravity * closed).any() for gravity in gravities):
         pulling = [gravity * closed for gravity in gravities if (gravity * closed).any()]
         height = max(0.0, *(float(np.max(_falls(scene, corners, gravity))) for gravity in pulling))
@@ -298,7 +297,7 @@ def highest_speed(body: Body | Emitter, end: float = math.inf) -> float:
         speed = float(np.linalg.norm(velocity))
     else:
         lower, upper = form.bounds()
-        offsets = _corners(lower, upper) - (lower + upper) / 2
+        offsets = box_corners(lower, upper) - (lower + upper) / 2
         speed = float(np.max(np.linalg.norm(velocity + offsets @ np.array(body.velocity_gradient).T, axis=1)))
     if isinstance(form, Points) and form.file_velocity is not None:
         speed += float(np.linalg.norm(form.file_velocity, axis=1).max())
@@ -330,10 +329,5 @@ def _falls(scene: Scene, corners: np.ndarray, gravity: np.ndarray) -> np.ndarray
         # Only its direction is used; its square could overflow.
         gravity = gravity / largest
     down = gravity / float(np.linalg.norm(gravity))
-    floor = np.max(_corners(np.array(scene.domain.origin), np.array(scene.domain.upper)) @ down)
+    floor = np.max(box_corners(np.array(scene.domain.origin), np.array(scene.domain.upper)) @ down)
     return floor - corners @ down
-
-
-def _corners(lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """Return the 2^d corners of a box, (2^d, d)."""
-    return np.array(list(product(*zip(lower, upper, strict=True))))

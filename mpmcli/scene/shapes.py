@@ -20,6 +20,7 @@ from mpmcli.scene.primitives import (
     Polygon,
     Solid,
     TurnedBox,
+    box_corners,
     grid_points,
     rotation,
 )
@@ -148,7 +149,7 @@ def _holds(outer: Solid, inner: Solid) -> bool:
         case Capsule():
             return bool(outer.contains(np.array([inner.start, inner.end]), inset=inner.radius).all())
         case Box():
-            return bool(outer.contains(np.array(list(product(*zip(*inner.bounds(), strict=True))))).all())
+            return bool(outer.contains(box_corners(*inner.bounds())).all())
         case Polygon():
             return bool(outer.contains(np.array(inner.vertices)).all())
     return False

@@ -17,7 +17,6 @@ from mpmcli.scene import Scene
 from mpmcli.scene.entry import tree_of
 from mpmcli.scene.expression import INITIAL, POSITION, VELOCITY, Number, Tree, apply, derivative, names_in
 from mpmcli.scene.quadrature import largest_of
-from mpmcli.scene.schema import Force
 from mpmcli.solver.drive.expressions import MOVES, DeviceValues, Entries, Formula, Place, RunValues, TimeTables, node_of
 from mpmcli.solver.machine.backend import Backend
 from mpmcli.solver.particles.arrays import ParticleArrays
@@ -35,15 +34,6 @@ MARGIN = 1.5
 
 # Measurement of the force on particles, given the first particle, their number, and the run; see `build_push`.
 Push = Callable[[int, int, int], tuple[float, float]]
-
-
-def names_of(scene: Scene, members: Sequence[int]) -> list[str]:
-    """Return the names of some bodies, given by their indices."""
-    return [scene.sources[i].name for i in members]
-
-
-def forces_on(scene: Scene, names: Sequence[str]) -> tuple[Force, ...]:
-    return tuple(force for force in scene.pushes if force.body is None or force.body in names)
 
 
 @dataclass(frozen=True)
@@ -83,7 +73,7 @@ class ForceTerms:
     @staticmethod
     def of(scene: Scene, names: Sequence[str], entries: Entries) -> "ForceTerms":
         """Return the forces on some bodies; their numbers are added to `entries`."""
-        forces = forces_on(scene, names)
+        forces = [force for force in scene.pushes if force.body is None or force.body in names]
         if not forces or not names:
             return ForceTerms()
         terms, found = [], set()
@@ -142,7 +132,8 @@ class Drives:
         entries = Entries(scene.domain.origin)
         steady = scene.domain.steady
         gravity = () if steady else tuple(entries.placed(tree_of(entry)) for entry in scene.domain.gravity)
-        forces = tuple(ForceTerms.of(scene, names_of(scene, own), entries) for own in members)
+        names = ([scene.sources[i].name for i in own] for own in members)
+        forces = tuple(ForceTerms.of(scene, own, entries) for own in names)
         moving = [collider.motion.rates for collider in scene.colliders if collider.driven]
         motions = tuple(tuple(entries.placed(tree) if names_in(tree) else None for tree in rates) for rates in moving)
         free = [collider for collider in scene.colliders if collider.free]
