@@ -6,8 +6,8 @@ momenta are exact, and the surface acts where it is, at any position on the grid
 material that has drifted in, see `LIFT`.
 
 Nodes gather from points, and points from nodes, so that the results depend neither on threads nor on the order in which
-points are found. A step calls, with a barrier after each: `find`, `spread_out`, `weigh`, for rigid bodies `meet` and
-`settle`, and `push`.
+points are found. A step calls, with a barrier after each: `find`, `spread_out`, `weigh`, for rigid bodies `push_rigid`
+and `settle`, and `push`.
 """
 
 import math
@@ -123,9 +123,9 @@ class ColliderPoints(Feature):
             ),
         ]
         if self.couples:
-            how = {"turns": 2, "rounds": ROUNDS, "part": meet_part, "item": meet_item, "words": "meet rigid bodies"}
+            how = {"turns": 2, "rounds": ROUNDS, "part": solve_part, "item": solve_item, "words": "meet rigid bodies"}
             found += [
-                Phase("meet", "rows", "points", body=meet_points, wanted=busy_row, **how),
+                Phase("solve_rigid", "rows", "points", body=push_rigid, wanted=busy_row, **how),
                 Phase("settle_points", "nodes", "points", body=settle_points, wanted=busy_row),
             ]
         push = Phase("push_points", "nodes", "points", body=push_points, wanted=last_row, words="let colliders push")
@@ -629,13 +629,13 @@ def weigh_points(at: ti.template(), node: ti.template(), _kick: float):
 
 
 @ti.func
-def meet_points(at: ti.template(), node: ti.template(), _kick: float):
+def push_rigid(at: ti.template(), node: ti.template(), _kick: float):
     """Add the impulses of the points of a node to the sums of rigid bodies."""
     at.features.points.push_rigid(at.grid, node, at.features.rigid)
 
 
 @ti.func
-def meet_part(phases: ti.template(), at: ti.template()):
+def solve_part(phases: ti.template(), at: ti.template()):
     """Find the velocities of rigid bodies: sum the impulses of points in even turns, and solve in odd turns."""
     if at.turn % 2 == 0:
         phases.each_node(at)
@@ -644,7 +644,7 @@ def meet_part(phases: ti.template(), at: ti.template()):
 
 
 @ti.func
-def meet_item(phases: ti.template(), at: ti.template()):
+def solve_item(phases: ti.template(), at: ti.template()):
     """The same for a row of nodes, or a run, on a GPU."""
     if ti.static(at.turn % 2 == 0):
         phases.each_row(at)
