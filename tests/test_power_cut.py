@@ -12,7 +12,7 @@ from mpmcli.materials.registry import parameter_models
 from mpmcli.output import open_result, store
 from mpmcli.output.checkpoints import read_checkpoints, write_checkpoint
 from mpmcli.scene import LoadedScene, parse_scene
-from mpmcli.simulation import stored_run
+from mpmcli.simulation import simulate as simulation
 from mpmcli.simulation.settings import RunSettings
 from mpmcli.simulation.simulate import simulate
 from mpmcli.solver.engine import run as engine_run
@@ -55,7 +55,7 @@ def at_once() -> object:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(engine_run, "FIRST", PARTICLES * STEPS)
         patch.setattr(engine_run.LaunchBudget, "took", lambda *_: None)
-        patch.setattr(stored_run, "HOLD", 0.0)
+        patch.setattr(simulation, "HOLD", 0.0)
         patch.setattr(store, "ASIDE", 0)
         yield
 

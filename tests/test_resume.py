@@ -27,8 +27,7 @@ from mpmcli.output.layout import DAMAGED, FrameIndex, sealed_segments
 from mpmcli.output.vtkhdf import read_index_of
 from mpmcli.scene import Scene, load_scene, parse_scene
 from mpmcli.simulation.resume import Resumption, find_resumption, go_on, require_same_run, take_over
-from mpmcli.simulation.simulate import RunSettings, simulate
-from mpmcli.simulation.stored_run import Checkpointer
+from mpmcli.simulation.simulate import Checkpointer, RunSettings, simulate
 from mpmcli.solver.engine import run as engine_run
 from mpmcli.solver.engine.run import Run, build_run
 from mpmcli.solver.engine.saved_state import SavedState
@@ -98,11 +97,11 @@ from pathlib import Path
 from types import SimpleNamespace
 from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import load_scene
-from mpmcli.simulation import stored_run
+from mpmcli.simulation import simulate as simulation
 from mpmcli.simulation.simulate import RunSettings, simulate
 from mpmcli.solver.engine import run as engine_run
 scene, directory, form = sys.argv[1:]
-engine_run.FIRST, stored_run.HOLD = 2000, 0.0
+engine_run.FIRST, simulation.HOLD = 2000, 0.0
 engine_run.LaunchBudget.took = lambda *_: None
 def told(row, summary):
     if summary.frames == 3:
