@@ -115,13 +115,13 @@ def test_a_config_runs(path, tmp_path):
     assert result.dimension == scene.dimension and result.header.title == scene.title
     assert result.times.tolist() == [0.0, end / 2, end]
     stored = {"velocity", *result.field_names}
-    assert stored == {"velocity", *scene.output.fields} | ({"status"} if scene.comes_and_goes else set())
+    assert stored == {"velocity", *scene.output.fields} | ({"status"} if scene.particle_count_varies else set())
     first, last = result.frame(0), result.frame(2)
     assert last.step >= 2
     lower = np.array(scene.domain.origin)
     assert (last.position >= lower).all() and (last.position <= lower + scene.domain.size).all()
     assert not np.array_equal(first.position, last.position)
-    if scene.comes_and_goes:
+    if scene.particle_count_varies:
         # What comes in brings energy and mass with it.
         return
     energies = [row.energy for row in result.ledger]

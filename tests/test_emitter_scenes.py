@@ -147,7 +147,7 @@ def test_the_effective_scene_has_them_all():
     text = GOOD.replace("[time]", 'walls = { x_max = "open" }\n[time]') + GOOD_JET + GOOD_PUSH
     loaded = load(text)
     again = load(scene_to_toml(loaded.scene)).scene
-    assert again == loaded.scene and again.comes_and_goes
+    assert again == loaded.scene and again.particle_count_varies
     assert any(" and jet: bulk_modulus" in note for note in loaded.notes)
 
 

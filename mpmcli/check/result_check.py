@@ -337,7 +337,7 @@ def _check_frames(opened: OpenedResult, findings: FrameFindings, stop: Callable[
                 continue
             momentum.check(frame, entry.row)
             crowd.check(frame)
-            if not header.comes_and_goes:
+            if not header.particle_count_varies:
                 stretch.check(frame)
     return {**stretch.figures, **crowd.figures, **momentum.figures, "bytes": size}
 
@@ -401,7 +401,7 @@ def check_ledger(entries: Sequence[Entry], header: RunHeader, findings: FrameFin
             "Forces, walls that move, or a gravity that depends on time or acts along a periodic axis do work, so that "
         )
         what += "energy and momentum are not conserved"
-        if header.comes_and_goes:
+        if header.particle_count_varies:
             what = "Material comes or goes, so that energy and momentum are not conserved"
         elif not header.driven:
             what = "Colliders that move do work on rigid bodies, too, so that the balance of energy is not known"

@@ -134,7 +134,7 @@ def _present(trajectory: SubsampledTrajectory) -> Iterator[np.ndarray]:
     for block in trajectory.blocks("position"):
         frames = slice(first * stride, (first + len(block)) * stride, stride)
         first += len(block)
-        if source.header.comes_and_goes:
+        if source.header.particle_count_varies:
             status = source.read(STATUS, frames, trajectory.particles)
             block = np.where((status == ACTIVE)[..., None], block, np.nan)
         yield block
@@ -151,7 +151,7 @@ def require_alike(trajectories: Sequence[SubsampledTrajectory], form: str) -> No
         )
     for each in trajectories:
         number, header = each.source.number, each.source.header
-        if header.comes_and_goes and not each.always:
+        if header.particle_count_varies and not each.always:
             raise InputError(
                 f"trajectory {number} has particles that come or go, and {form} cannot say which are there: --present "
                 'always takes those that are there in all frames; npz, parquet and zarr keep the field "status" of all.'

@@ -162,7 +162,7 @@ class RunHeader:
         steady_gravity: (d,), m/s^2, with 0 for each entry that depends on time; None if unknown.
         driven: whether energy and momentum have a source: forces, moving walls, time-dependent gravity, gravity along a
             periodic axis, or particles that come and go.
-        comes_and_goes: whether particles come and go; drops: whether frames contain only the particles present.
+        particle_count_varies: whether particles come and go; drops: whether frames contain only the particles present.
         open_axes: for each axis, whether a face normal to it is open.
         total: whether elastic bodies are computed on the grid of their state at rest.
         keeps_spin: whether the transfers conserve angular momentum, as APIC does on the updated grid.
@@ -188,7 +188,7 @@ class RunHeader:
     gravity: np.ndarray | None
     steady_gravity: np.ndarray | None
     driven: bool
-    comes_and_goes: bool
+    particle_count_varies: bool
     drops: bool
     open_axes: tuple[bool, ...]
     total: bool
@@ -254,7 +254,7 @@ class RunHeader:
         runs_on = steady is not None and bool(steady[periodic].any())
         total = solver.solids == "total"
         opens = tuple(OPEN in pair for pair in faces)
-        comes_and_goes = bool(scene.emitters) or any(opens)
+        particle_count_varies = bool(scene.emitters) or any(opens)
         moved = bool(domain.wall_velocity or scene.forces or scene.impulses)
         friction = domain.friction if isinstance(domain.friction, dict) else {"default": domain.friction}
         rough = [any(friction.get(name, 0) > 0 for name in ("default", f"{a}_min", f"{a}_max")) for a in AXES]
@@ -269,8 +269,8 @@ class RunHeader:
             upper=origin + facts.size if placed else None,
             gravity=None if timed else steady,
             steady_gravity=steady,
-            driven=timed or runs_on or moved or comes_and_goes,
-            comes_and_goes=comes_and_goes,
+            driven=timed or runs_on or moved or particle_count_varies,
+            particle_count_varies=particle_count_varies,
             drops=scene.output.drop_retired,
             open_axes=opens,
             total=total,

@@ -247,7 +247,7 @@ def result_of_start(scene: Scene) -> Iterator[tuple[Result, tuple[Arrow, ...]]]:
         np.concatenate([np.broadcast_to(one.velocity, one.position.shape) for one in found]).astype(np.float32),
         np.repeat(np.arange(len(sources), dtype=np.int32), counts),
         np.repeat(np.array([names.index(source.material.law) for source in sources], np.int32), counts),
-        {STATUS: np.concatenate(there).astype(np.int8)} if scene.comes_and_goes else {},
+        {STATUS: np.concatenate(there).astype(np.int8)} if scene.particle_count_varies else {},
     )
     zero = (0.0,) * d
     row = LedgerRow(

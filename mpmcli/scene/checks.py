@@ -65,7 +65,7 @@ def emitter_problems(scene: Scene) -> Iterator[Problem]:
             yield Problem((*where, "start"), said)
             continue
         yield from (Problem((*where, key), said) for key, said in _emitted(emitter, scene))
-    if scene.output.drop_retired and not scene.comes_and_goes:
+    if scene.output.drop_retired and not scene.particle_count_varies:
         said = "is for scenes with emitters or open faces, where particles come and go; leave it out"
         yield Problem(("output", "drop_retired"), said)
     opens = scene.domain.walls.any_open(scene.dimension)

@@ -444,7 +444,7 @@ class Scene(Table):
         return (*self.forces, *made)
 
     @property
-    def comes_and_goes(self) -> bool:
+    def particle_count_varies(self) -> bool:
         """Whether particles enter or leave during the run."""
         return bool(self.emitters) or self.domain.walls.any_open(self.dimension)
 

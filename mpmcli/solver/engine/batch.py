@@ -100,7 +100,7 @@ class Batch:
                 uses_f_bar=shares,
                 levels=levels_volume(kind.settings, law),
                 has_wall_friction=slips_in(kind.settings, kind.rough),
-                comes_and_goes=kind.inflow.any,
+                particle_count_varies=kind.inflow.any,
             )
             for law, shares, capacity, bodies, forces in zip(
                 kind.members, averaged, kind.particles, kind.bodies, kind.drives.forces, strict=True

@@ -211,7 +211,7 @@ class CpuLaunch:
                     self.device.features.surfaces.widen(layer, base)
             if ti.static(self.phases.shared):
                 self.phases.places.divide(g, own)
-        if ti.static(self.device.comes_and_goes):
+        if ti.static(self.device.particle_count_varies):
             # Without active particles the box must still be valid.
             if high[0] < 0:
                 for a in ti.static(range(self.dimension)):

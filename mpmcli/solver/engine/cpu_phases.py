@@ -233,7 +233,7 @@ class CpuPhases(RunPhases):
         self.places = CpuRegions(device, self.regions)
         self.colours = device.orders[0].colours
         # Particles that entered since the sort follow after all colours, on one thread.
-        self.passes = self.colours + device.comes_and_goes
+        self.passes = self.colours + device.particle_count_varies
         self.kinds: tuple[PartKind, ...] = ()
         coloured, end = [], 0
         for phase in device.phases:
@@ -401,7 +401,7 @@ class CpuPhases(RunPhases):
                 pencil = at.order.pencil_of(at.turn, r)
                 begin, end = at.order.first_particle_of(pencil), at.order.first_particle_of(pencil + 1)
                 ti.static(at.item)(at, begin, end, at.step.relaxed)
-        if ti.static(self.device.comes_and_goes and not at.grid.sparse):
+        if ti.static(self.device.particle_count_varies and not at.grid.sparse):
             if at.turn == self.colours and at.region == 0 and at.part == 0:
                 first, after = self.come_in(at.g, at.order, at.run)
                 ti.static(at.item)(at, first, after, at.step.relaxed)
@@ -466,7 +466,7 @@ class CpuPhases(RunPhases):
             first, after = self.pencils(at.order, at.turn, at.region, at.part)
             scatter_pencils(at, first, after, kick, relaxed)
         # On a sparse grid a sort follows each entry of particles.
-        if ti.static(self.device.comes_and_goes and not at.grid.sparse):
+        if ti.static(self.device.particle_count_varies and not at.grid.sparse):
             if at.turn == self.colours and at.region == 0 and at.part == 0:
                 first, after = self.come_in(at.g, at.order, at.run)
                 scatter_range(at.particles, at.g, at.group, first, after, kick, relaxed)
@@ -591,7 +591,7 @@ class CpuPhases(RunPhases):
     def write_frame(self, at: ti.template()):
         """Write the frame data of particles of the g-th group."""
         first, after = self.places.particles_of(at.g, at.w, at.region, at.run.particles[at.g])
-        if ti.static(self.device.comes_and_goes):
+        if ti.static(self.device.particle_count_varies):
             # All particles, including waiting and retired ones.
             first, after = self.places.even_part(at.run.capacity[at.g], at.region)
             first += at.w * ti.static(self.device.capacity[at.g])

@@ -59,9 +59,9 @@ class Device:
     drift_allowed: float = 1.0
 
     @property
-    def comes_and_goes(self) -> bool:
+    def particle_count_varies(self) -> bool:
         """Whether particles enter or leave during a run."""
-        return self.groups[0].comes_and_goes
+        return self.groups[0].particle_count_varies
 
     @property
     def phases(self) -> tuple[Phase, ...]:
@@ -246,7 +246,7 @@ class RunPhases:
             self.device.features.points.count[w] = 0
         for g in ti.static(range(len(self.members))):
             # A law may not have particles yet.
-            step.rate[g] = 0.0 if ti.static(self.device.comes_and_goes) else NOTHING
+            step.rate[g] = 0.0 if ti.static(self.device.particle_count_varies) else NOTHING
             step.volume_change[g] = 0.0
 
     @ti.func

@@ -101,7 +101,7 @@ class CpuEmission:
     @ti.func
     def count_active(self, run: ti.template()):
         """Count the active particles after a sort."""
-        if ti.static(self.device.comes_and_goes):
+        if ti.static(self.device.particle_count_varies):
             for g in ti.static(range(len(self.numbered))):
                 after = run.w * ti.static(self.device.orders[g].bins + 1) + ti.static(self.device.orders[g].tiles)
                 run.particles[g] = self.device.orders[g].start[after] - run.w * ti.static(self.device.capacity[g])

@@ -543,7 +543,7 @@ class GpuLaunch:
         if self.sorts:
             for g in range(len(self.members)):
                 self._call(self.sort, g)
-            if self.device.comes_and_goes:
+            if self.device.particle_count_varies:
                 active = self.active.to_numpy()
                 for g in range(len(self.members)):
                     runs.particles[g][due] = active[due, g]

@@ -141,7 +141,7 @@ def host_bytes_of(scene: Scene, members: Sequence[Law], particles: int, real: in
     widths = {"velocity": 0, "initial_position": d, "affine": d * d, "deformation_gradient": d * d, "stress": 9}
     fields = sum(widths.get(name, 1) for name in scene.output.fields)
     # The frame: positions, velocities and fields.
-    frame = real * (2 * d + fields) + scene.comes_and_goes
+    frame = real * (2 * d + fields) + scene.particle_count_varies
     # The array that is being written: particle numbers, or in 2D a vector or matrix padded to 3D.
     frame += 4 if d == 3 else real * (3 if {"affine", "deformation_gradient"}.isdisjoint(scene.output.fields) else 9)
     if len(scene.sources) > 1:
@@ -157,7 +157,9 @@ def host_bytes_of(scene: Scene, members: Sequence[Law], particles: int, real: in
 def _frame_columns(scene: Scene, members: Sequence[Law]) -> int:
     """Return how many numbers per particle a frame is built from."""
     internal = max(len(law.internal) for law in members)
-    return FrameColumns(scene.dimension, internal, scene.output.fields, comes_and_goes=scene.comes_and_goes).count
+    return FrameColumns(
+        scene.dimension, internal, scene.output.fields, particle_count_varies=scene.particle_count_varies
+    ).count
 
 
 def require_memory(plan: Plan) -> None:

@@ -292,7 +292,7 @@ class FrameBuilder:
         self._names = [name for name in scene.output.fields if name not in ("velocity", "initial_position")]
         internal = max(len(group.law.internal) for group in groups)
         shown = [*self._names, *columns]
-        self.columns = FrameColumns(scene.dimension, internal, shown, comes_and_goes=scene.comes_and_goes)
+        self.columns = FrameColumns(scene.dimension, internal, shown, particle_count_varies=scene.particle_count_varies)
         self._waits = np.array([b.waits for b in particles])
         self._origin = np.array(scene.domain.origin)
         # Far from zero, single precision does not resolve neighbouring particles; the solver does, because its
@@ -314,7 +314,7 @@ class FrameBuilder:
         (times, n), d = arrays.reals.shape[:2], scene.dimension
         position = np.empty((times, n, d), self._position_type)
         velocity = np.empty((times, n, d), arrays.reals.dtype)
-        status = np.empty((times, n), np.int8) if scene.comes_and_goes else None
+        status = np.empty((times, n), np.int8) if scene.particle_count_varies else None
         fields: dict[str, np.ndarray] = {}
         totals = _Totals(scene, arrays["x"], times, self._waits, flows=self._flows)
         for rows in parts_of(n):
@@ -392,8 +392,8 @@ class _Totals:
         self._low, self._high = np.full(times, np.inf), np.full(times, -np.inf)
         # Numbers of entered and of retired particles per body.
         self._entered, self._retired = (np.zeros((times, len(waits)), np.int64) for _ in range(2))
-        self._comes_and_goes = scene.comes_and_goes
-        at_once = 1 if scene.comes_and_goes else times_at_once(domain.cells)
+        self._particle_count_varies = scene.particle_count_varies
+        at_once = 1 if scene.particle_count_varies else times_at_once(domain.cells)
         self._filled = [
             (own, FilledCells(x[own], domain.spacing, domain.cells, domain.periodic))
             for own in (slice(t, t + at_once) for t in range(0, times, at_once) if flows)
@@ -438,7 +438,7 @@ class _Totals:
             "volume_ratio_max": np.where(none, 1.0, self._high),
             "volume_error": np.concatenate(errors) if errors else np.zeros(len(none)),
         }
-        if self._comes_and_goes:
+        if self._particle_count_varies:
             for name, counts in (("emitted", self._entered * self._waits), ("retired", self._retired)):
                 found[name], found[f"{name}_mass"] = counts.sum(axis=1), counts @ masses
         return found

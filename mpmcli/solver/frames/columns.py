@@ -43,7 +43,7 @@ class FrameColumns:
     """
 
     def __init__(
-        self, dimension: int, internal: int, fields: Collection[str] = (), *, comes_and_goes: bool = False
+        self, dimension: int, internal: int, fields: Collection[str] = (), *, particle_count_varies: bool = False
     ) -> None:
         """Assign columns, given the largest number of internal variables of a law and the fields of the frames."""
         d = dimension
@@ -54,7 +54,7 @@ class FrameColumns:
             widths["gradient"] = d * d
         if not set(STRESSES).isdisjoint(fields):
             widths["tau"] = len(stress_entries(d))
-        if comes_and_goes:
+        if particle_count_varies:
             widths["activity"] = 1
         self.dimension, self.widths, self.count = d, widths, 0
         self.first = dict.fromkeys(("affine", "gradient", "tau", "activity"), -1)

@@ -149,7 +149,7 @@ def write_range(
             if tau_at >= 0:
                 for column in ti.static(range(len(entries))):
                     frame_buffer[r, tau_at + column] = found[2 + inners + d * d + column, lane]
-            if ti.static(group.comes_and_goes):
+            if ti.static(group.particle_count_varies):
                 frame_buffer[r, activity_at] = ti.cast(group.activity[p], float)
         begin += LANES
 

@@ -72,7 +72,7 @@ class ParticleArrays:
         layers: number of layers of the grid.
         layer: per row of the table, the layer of nodes of the body.
         activity: (n) int, status of each particle: waiting, active, retired or blocked (`particles.sort`); None if all
-            are always active (`comes_and_goes` is false).
+            are always active (`particle_count_varies` is false).
         force: the forces on the particles, if the group `has_body_force`.
         mouths, emitters: the mouths of emitters, and the indices of those that emit particles of the group.
         run: number of the run of a view.
@@ -95,7 +95,7 @@ class ParticleArrays:
         uses_f_bar: bool,
         levels: bool,
         has_wall_friction: bool,
-        comes_and_goes: bool,
+        particle_count_varies: bool,
     ) -> None:
         """Allocate fields for `count` particles, and a table with these numbers of rows and columns."""
         self.law, self.capacity, self.dimension = law, count, law.dimension
@@ -104,7 +104,7 @@ class ParticleArrays:
         self.many_bodies, self.serial, self.total, self.uses_f_bar = many_bodies, serial, total, uses_f_bar
         self.levels, self.averages = levels, uses_f_bar or levels
         self.keeps_initial, self.evened = keeps_initial or total, uses_f_bar and not total
-        self.has_wall_friction, self.comes_and_goes = has_wall_friction, comes_and_goes
+        self.has_wall_friction, self.particle_count_varies = has_wall_friction, particle_count_varies
         self.layers, self.surfaced = layers.count, layers.separate and law.surfaced
         wanted = self._wanted()
         sizes = {float: np.dtype(self.real).itemsize, int: 4}
@@ -145,7 +145,7 @@ class ParticleArrays:
         fields |= {"slip": (float, d, 1)} if self.has_wall_friction else {}
         fields |= {"surface": (float, d + 1, 1)} if self.surfaced else {}
         fields |= {"id": (int, 1, 1)} | ({"body": (int, 1, 1)} if self.many_bodies else {})
-        return fields | ({"activity": (int, 1, 1)} if self.comes_and_goes else {})
+        return fields | ({"activity": (int, 1, 1)} if self.particle_count_varies else {})
 
     def push_by(self, force: object) -> None:
         self.has_body_force, self.force = True, force
@@ -196,7 +196,7 @@ class ParticleArrays:
             + ["volume_growth"] * self.evened
         )
         initial += ["surface"] * self.surfaced
-        labels = ["id"] + ["body"] * (self.body is not None) + ["activity"] * self.comes_and_goes
+        labels = ["id"] + ["body"] * (self.body is not None) + ["activity"] * self.particle_count_varies
         return dict(zip([*names, *initial, *labels], (*self.state, *self.labels), strict=True))
 
     def read(self, first: int, count: int, bodies: Sequence[int], row: int = 0) -> dict[str, np.ndarray]:
@@ -227,7 +227,7 @@ class ParticleArrays:
             found["deformation"] = 1 + found["deformation"].reshape(count)
         found["id"] = labels[:, 0]
         found["body"] = np.array(bodies, np.int32)[labels[:, 1] - row]
-        if self.comes_and_goes:
+        if self.particle_count_varies:
             found["activity"] = labels[:, 2]
         return found
 
@@ -273,7 +273,7 @@ class ParticleArrays:
                 labels[q, 1] = self.body[p]
             else:
                 labels[q, 1] = 0
-            if ti.static(self.comes_and_goes):
+            if ti.static(self.particle_count_varies):
                 labels[q, 2] = self.activity[p]
 
     @ti.kernel
@@ -314,7 +314,7 @@ class ParticleArrays:
             self.id[p] = labels[q, 0]
             if ti.static(self.many_bodies):
                 self.body[p] = labels[q, 1]
-            if ti.static(self.comes_and_goes):
+            if ti.static(self.particle_count_varies):
                 self.activity[p] = labels[q, 2]
 
     @ti.func

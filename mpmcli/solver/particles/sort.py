@@ -77,8 +77,8 @@ class TileOrder:
         self.tiles = grid.tile_count
         # If particles come and go, the tiles are followed by a bin of waiting and blocked particles and a bin of
         # retired ones.
-        self.comes_and_goes = group.comes_and_goes
-        self.bins = self.tiles + 2 * self.comes_and_goes
+        self.particle_count_varies = group.particle_count_varies
+        self.bins = self.tiles + 2 * self.particle_count_varies
         self.extent = tuple(n * grid.spacing for n in grid.cells)
         self.colours = 2 ** (grid.dimension - 1)
         self.spans = -(-self.bins // SPAN)
@@ -107,7 +107,7 @@ class TileOrder:
     def status_of(self, p: int):
         """Return the status of particle p; an active particle beyond an open face is retired first."""
         status = ACTIVE
-        if ti.static(self.comes_and_goes):
+        if ti.static(self.particle_count_varies):
             status = self.group.activity[p]
             if status == ACTIVE:
                 for axis, side in ti.static(self.grid.opens):
@@ -129,7 +129,7 @@ class TileOrder:
     def bin_of(self, p: int):
         """Return the bin of particle p: its tile if it is active, otherwise one of the bins after the tiles."""
         place = 0
-        if ti.static(self.comes_and_goes):
+        if ti.static(self.particle_count_varies):
             status = self.status_of(p)
             if status == ACTIVE:
                 place = self.tile_of(p)

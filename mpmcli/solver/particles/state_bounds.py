@@ -142,7 +142,7 @@ def state_bounds_of(group: object, maxima: Sequence[float]) -> StateBounds:
 
 def floor_of(scene: Scene, law: Law, members: Sequence[int]) -> np.ndarray | None:
     """Return maxima for undeformed particles at the speed of the emitters; None if some particle is always there."""
-    if scene.bodies and not scene.comes_and_goes:
+    if scene.bodies and not scene.particle_count_varies:
         return None
     speeds = [highest_speed(scene.sources[i], scene.time.end) for i in members if i >= len(scene.bodies)]
     at_rest = [value for v in law.internal for value in (float(v.at_rest), -float(v.at_rest))]
