@@ -68,8 +68,7 @@ def near_bodies(phases: ti.template(), at: ti.template()):
 @ti.func
 def rows_near_bodies(phases: ti.template(), grid: ti.template(), at: ti.template()):
     """Return the first row of a part of the nodes where bodies may be in contact, and the one after the last."""
-    first, after = phases.places.even_part(grid.row_count(), at.region)
-    return phases.range_of_part(first, after, at.part)
+    return phases.places.part_of(at, grid.row_count())
 
 
 @ti.func
@@ -103,8 +102,7 @@ def find_surface_part(phases: ti.template(), at: ti.template()):
     """Find the surface data of particles of the g-th group."""
     (surfaces,) = ti.static((phases.device.features.contact.surfaces,))
     (grid,) = ti.static(near_bodies(phases, at))
-    first, after = phases.places.even_part(surfaces.tile_count(grid, at.w), at.region)
-    first, after = phases.range_of_part(first, after, at.part)
+    first, after = phases.places.part_of(at, surfaces.tile_count(grid, at.w))
     for q in range(first, after):
         surfaces.find_surface_points(at.g, grid, at.w, q)
 

@@ -99,13 +99,13 @@ class CpuRegions:
     """The regions of a single run; with several runs, each run is one region.
 
     Attributes:
-        regions: number of regions.
+        regions: number of regions, and `parts` of a loop over each.
         pencils: for each region except the last, the first pencil after it, per group.
         rows: for each region except the last, the first row of nodes after it.
     """
 
-    def __init__(self, device: Device, regions: int) -> None:
-        self.device, self.regions, self.dimension = device, regions, device.grid.dimension
+    def __init__(self, device: Device, regions: int, parts: int) -> None:
+        self.device, self.regions, self.parts, self.dimension = device, regions, parts, device.grid.dimension
         self.groups = tuple(range(len(device.groups)))
         self.pencils = tuple(ti.field(int, shape=max(regions - 1, 1)) for _ in device.groups)
         self.rows = ti.field(int, shape=max(regions - 1, 1))
@@ -116,40 +116,52 @@ class CpuRegions:
         return share_start(count, region, self.regions), share_start(count, region + 1, self.regions)
 
     @ti.func
-    def rows_of(self, grid: ti.template(), region: int):
-        """Return the first row of nodes of a region, and the one after the last."""
-        first, after = 0, grid.row_count()
-        if ti.static(grid.sparse):
-            first, after = self.even_part(after, region)
+    def range_of_part(self, at: ti.template(), first: int, after: int):
+        """Return the first index of a part of a range, and the one after the last."""
+        size, parts = after - first, ti.static(self.parts)
+        return first + share_start(size, at.part, parts), first + share_start(size, at.part + 1, parts)
+
+    @ti.func
+    def part_of(self, at: ti.template(), count: int):
+        """Return the first index of a part of a region in a range of `count`, and the one after the last."""
+        first, after = self.even_part(count, at.region)
+        return self.range_of_part(at, first, after)
+
+    @ti.func
+    def rows_of(self, at: ti.template()):
+        """Return the first row of nodes of a part, and the one after the last."""
+        first, after = 0, at.grid.row_count()
+        if ti.static(at.grid.sparse):
+            first, after = self.even_part(after, at.region)
         elif ti.static(self.regions > 1):
-            if region > 0:
-                first = self.rows[region - 1]
-            if region < self.regions - 1:
-                after = self.rows[region]
-        return first, after
+            if at.region > 0:
+                first = self.rows[at.region - 1]
+            if at.region < self.regions - 1:
+                after = self.rows[at.region]
+        return self.range_of_part(at, first, after)
 
     @ti.func
-    def particles_of(self, g: ti.template(), w: int, region: int, count: int):
-        """Return the first of `count` particles of the g-th group in a region of run w, and the one after the last."""
-        first = w * ti.static(self.device.capacity[g])
-        after = first + count
+    def particles_of(self, at: ti.template()):
+        """Return the first particle of a part of the g-th group, and the one after the last."""
+        first = at.w * ti.static(self.device.capacity[at.g])
+        after = first + at.run.particles[at.g]
         if ti.static(self.regions > 1):
-            if region > 0:
-                first = self.device.orders[g].first_particle_of(self.pencils[g][region - 1])
-            if region < self.regions - 1:
-                after = self.device.orders[g].first_particle_of(self.pencils[g][region])
-        return first, after
+            if at.region > 0:
+                first = at.order.first_particle_of(self.pencils[at.g][at.region - 1])
+            if at.region < self.regions - 1:
+                after = at.order.first_particle_of(self.pencils[at.g][at.region])
+        return self.range_of_part(at, first, after)
 
     @ti.func
-    def pencils_of(self, g: ti.template(), region: int):
-        """Return the first pencil of a region for the g-th group, and the one after the last."""
-        first, after = 0, self.device.orders[g].pencils()
+    def pencils_of(self, at: ti.template()):
+        """Return the first pencil of a part for the g-th group, and the one after the last."""
+        first, after = 0, at.order.pencils()
         if ti.static(self.regions > 1):
-            if region > 0:
-                first = self.pencils[g][region - 1]
-            if region < self.regions - 1:
-                after = self.pencils[g][region]
-        return first, after
+            if at.region > 0:
+                first = self.pencils[at.g][at.region - 1]
+            if at.region < self.regions - 1:
+                after = self.pencils[at.g][at.region]
+        return self.range_of_part(at, first, after)
 
     @ti.func
     def divide(self, g: ti.template(), count: int):
@@ -214,7 +226,6 @@ class CpuPhases(RunPhases):
         regions: number of regions per run, one for each of these threads.
         apart: whether the functions of the parts are kept out of the launch.
         places: ranges of particles and nodes of the regions.
-        loop_parts: parts of a loop over a region.
         kinds: kinds of parts.
         clears: number of the first phase of steps that do not shift particles.
         last_of_step, sorts, marking, last_of_sort, first_of_frame, last_of_frame: numbers of phases.
@@ -224,13 +235,13 @@ class CpuPhases(RunPhases):
 
     def __init__(self, device: Device, layout: Layout) -> None:
         super().__init__(device, layout)
-        self.loop_parts = SPARSE_PARTS if device.grid.sparse else PARTS
         self.shared = device.runs == 1 and device.threads > 1
         self.regions = device.threads if self.shared else 1
         # LLVM does not inline a function that has a second call, even one that is never executed. Compilation is a
         # quarter shorter, and a step of few particles up to a third longer: for short runs, with few optimisations.
         self.apart = not ti.lang.impl.current_cfg().advanced_optimization
-        self.places = CpuRegions(device, self.regions)
+        parts = SPARSE_PARTS if device.grid.sparse else PARTS
+        self.places = CpuRegions(device, self.regions, parts if self.shared else 1)
         self.colours = device.orders[0].colours
         # Particles that entered since the sort follow after all colours, on one thread.
         self.passes = self.colours + device.particle_count_varies
@@ -309,19 +320,13 @@ class CpuPhases(RunPhases):
         parts = 1
         if ti.static(self.shared):
             if phase < self.sorts or phase == self.last_of_frame:
-                parts = self.loop_parts
+                parts = self.places.parts
             for g, begin in ti.static(self.coloured):
                 colour = phase - begin
                 if colour >= 0 and colour < self.colours:
                     last = self.device.orders[g].work[colour, region + 1]
                     parts = last - self.device.orders[g].work[colour, region]
         return parts
-
-    @ti.func
-    def range_of_part(self, first: int, after: int, part: int):
-        """Return the first index of a part of a range, and the one after the last."""
-        size, shares = after - first, ti.static(self.loop_parts if self.shared else 1)
-        return first + share_start(size, part, shares), first + share_start(size, part + 1, shares)
 
     @ti.real_func
     def do(
@@ -362,12 +367,10 @@ class CpuPhases(RunPhases):
     def each_node(self, at: ti.template()):
         """Apply the function of a phase to the nodes in use of all layers."""
         if ti.static(at.grid.sparse):
-            first, after = self.places.even_part(at.grid.sizes[PENCILS], at.region)
-            first, after = self.range_of_part(first, after, at.part)
+            first, after = self.places.part_of(at, at.grid.sizes[PENCILS])
             nodes_of_blocks(at, at.grid.pencils[first], at.grid.pencils[after], at.step.kick)
         else:
-            first, after = self.places.rows_of(at.grid, at.region)
-            first, after = self.range_of_part(first, after, at.part)
+            first, after = self.places.rows_of(at)
             if ti.static(at.wanted):
                 own = self.used_by(at, 0)
                 (inner,) = ti.static((at.in_layer(0, own),))
@@ -381,8 +384,7 @@ class CpuPhases(RunPhases):
     @ti.func
     def shift_nodes(self, at: ti.template()):
         """Apply the function of a phase of a shift to the nodes in use."""
-        first, after = self.places.rows_of(at.grid, at.region)
-        first, after = self.range_of_part(first, after, at.part)
+        first, after = self.places.rows_of(at)
         last_axis = ti.static(self.dimension - 1)
         for row in range(first, after):
             node = at.grid.row_start(row)
@@ -409,20 +411,17 @@ class CpuPhases(RunPhases):
     @ti.func
     def each_particle(self, at: ti.template()):
         """Apply the function of a phase to particles."""
-        first, after = self.places.particles_of(at.g, at.w, at.region, at.run.particles[at.g])
-        first, after = self.range_of_part(first, after, at.part)
+        first, after = self.places.particles_of(at)
         ti.static(at.item)(at, first, after, at.step.relaxed)
 
     @ti.func
     def clear(self, at: ti.template()):
         """Clear nodes."""
         if ti.static(at.grid.sparse):
-            first, after = self.places.even_part(at.grid.sizes[BLOCKS], at.region)
-            first, after = self.range_of_part(first, after, at.part)
+            first, after = self.places.part_of(at, at.grid.sizes[BLOCKS])
             clear_blocks(at.grid, first, after)
         else:
-            first, after = self.places.rows_of(at.grid, at.region)
-            first, after = self.range_of_part(first, after, at.part)
+            first, after = self.places.rows_of(at)
             for layer in range(self.layer_count(at)):
                 own = self.used_by(at, layer)
                 (inner,) = ti.static((at.in_layer(layer, own),))
@@ -476,8 +475,7 @@ class CpuPhases(RunPhases):
         """Relax the volumes of particles of the g-th group, in steps that relax volumes."""
         relaxed = at.step.relaxed
         if relaxed > 0.0:
-            first, after = self.places.particles_of(at.g, at.w, at.region, at.run.particles[at.g])
-            first, after = self.range_of_part(first, after, at.part)
+            first, after = self.places.particles_of(at)
             change = 0.0
             for p in range(first, after):
                 stay_rolled(at.order.buffers.real, p)
@@ -507,8 +505,7 @@ class CpuPhases(RunPhases):
             own = self.used_by(at, layer)
             (inner,) = ti.static((at.in_layer(layer, own),))
             (grid,) = ti.static((inner.grid.within(own) if at.grid.layers > 1 else at.grid,))
-            first, after = self.places.even_part(inner.nodes.images.plane_nodes(grid), at.region)
-            first, after = self.range_of_part(first, after, at.part)
+            first, after = self.places.part_of(at, inner.nodes.images.plane_nodes(grid))
             for q in range(first, after):
                 if ti.static(rubs):
                     find_friction(inner.nodes.images, grid, q, gravity_step)
@@ -521,13 +518,11 @@ class CpuPhases(RunPhases):
         speed_squared = 0.0
         if ti.static(at.grid.sparse):
             # Whole pencils, because the loads on colliders are summed row by row.
-            first, after = self.places.even_part(at.grid.sizes[PENCILS], at.region)
-            first, after = self.range_of_part(first, after, at.part)
+            first, after = self.places.part_of(at, at.grid.sizes[PENCILS])
             begin, end = at.grid.pencils[first], at.grid.pencils[after]
             speed_squared = update_blocks(at, begin, end, self.gravity_of(at.step))
         else:
-            first, after = self.places.rows_of(at.grid, at.region)
-            first, after = self.range_of_part(first, after, at.part)
+            first, after = self.places.rows_of(at)
             for layer in range(self.layer_count(at)):
                 own = self.used_by(at, layer)
                 (inner,) = ti.static((at.in_layer(layer, own),))
@@ -539,13 +534,11 @@ class CpuPhases(RunPhases):
         """Gather and move particles of the g-th group."""
         dt, gravity_step = at.step.dt, self.gravity_of(at.step)
         if ti.static(at.grid.sparse):
-            first, after = self.places.pencils_of(at.g, at.region)
-            first, after = self.range_of_part(first, after, at.part)
+            first, after = self.places.pencils_of(at)
             begin, end = at.order.first_tile_of(first), at.order.first_tile_of(after)
             ti.atomic_max(at.step.rate[at.g], advance_tiles(at, begin, end, dt, gravity_step))
         else:
-            first, after = self.places.particles_of(at.g, at.w, at.region, at.run.particles[at.g])
-            first, after = self.range_of_part(first, after, at.part)
+            first, after = self.places.particles_of(at)
             rate = advance_range(at.particles, at.g, self.device.groups[at.g], first, after, dt, gravity_step)
             ti.atomic_max(at.step.rate[at.g], rate)
 
@@ -590,13 +583,12 @@ class CpuPhases(RunPhases):
     @ti.func
     def write_frame(self, at: ti.template()):
         """Write the frame data of particles of the g-th group."""
-        first, after = self.places.particles_of(at.g, at.w, at.region, at.run.particles[at.g])
+        first, after = self.places.particles_of(at)
         if ti.static(self.device.particle_count_varies):
             # All particles, including waiting and retired ones.
-            first, after = self.places.even_part(at.run.capacity[at.g], at.region)
+            first, after = self.places.part_of(at, at.run.capacity[at.g])
             first += at.w * ti.static(self.device.capacity[at.g])
             after += at.w * ti.static(self.device.capacity[at.g])
-        first, after = self.range_of_part(first, after, at.part)
         scratch, capacity = ti.static((self.device.orders[at.g].buffers, self.device.capacity[at.g]))
         offset = scratch_offset(scratch, at.g, at.w, capacity)
         write_range(
