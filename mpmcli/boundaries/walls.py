@@ -8,6 +8,8 @@ import math
 from collections.abc import Sequence
 from copy import copy
 
+import numpy as np
+
 from mpmcli.boundaries.feature import Feature, changed
 from mpmcli.boundaries.rows import Rows
 from mpmcli.quick_taichi import ti
@@ -23,86 +25,64 @@ PERIODIC_REACH = 3
 AWAY = -1
 
 
-def moving_faces(scene: Scene) -> tuple[tuple[int, int], ...]:
-    """Return (axis, side) of every face of a scene that moves (docs/theory.md, 3.7)."""
-    found = scene.domain.wall_velocities
-    return tuple((a, side) for a, pair in enumerate(found) for side in (0, 1) if any(pair[side]))
-
-
 @ti.data_oriented
-class MovingFaces(Feature):
-    """Velocities of the faces that move. They are data, so that runs that differ in them share kernels.
+class FaceNumbers(Feature):
+    """A number, or a vector, of some faces. They are data, so that runs that differ in them share kernels.
 
     Attributes:
+        key: property of the domain with the numbers of all faces, by axis and side.
         faces: (axis, side) of every such face.
-        velocity: velocity of each face of each run, m/s.
+        numbers: that of each face of each run.
         first: row of the first face of the current run.
     """
+
+    key: str
+
+    def __init__(self, faces: Sequence[tuple[int, int]], numbers: ti.Field | None) -> None:
+        self.faces, self.first = tuple(faces), 0
+        if self.faces:
+            self.numbers, self._rows = numbers, Rows(numbers)
+
+    @classmethod
+    def in_scene(cls, scene: Scene) -> tuple[tuple[int, int], ...]:
+        """Return (axis, side) of every face of a scene whose number is not 0."""
+        numbers = getattr(scene.domain, cls.key)
+        return tuple((a, side) for a, pair in enumerate(numbers) for side in (0, 1) if np.any(pair[side]))
+
+    def write(self, scene: Scene, run: int = 0) -> None:
+        """Set the numbers of a run."""
+        if self.faces:
+            numbers = getattr(scene.domain, self.key)
+            self._rows.write(run * len(self.faces), [numbers[axis][side] for axis, side in self.faces])
+
+    def viewed(self, view: object) -> "FaceNumbers":
+        return changed(self, first=view.w * len(self.faces))
+
+    @ti.func
+    def of(self, face: ti.template()):
+        """Return the number of a face by its index in `faces`."""
+        return self.numbers[self.first + face]
+
+
+class MovingFaces(FaceNumbers):
+    """Velocities of the faces that move (docs/theory.md, 3.7), m/s."""
+
+    key = "wall_velocities"
 
     def __init__(self, faces: Sequence[tuple[int, int]], dimension: int = 0, runs: int = 1) -> None:
-        self.faces = tuple(faces)
-        self.first = 0
-        if faces:
-            self.velocity = ti.Vector.field(dimension, float, shape=runs * len(self.faces))
-            self._rows = Rows(self.velocity)
-
-    def write(self, scene: Scene, run: int = 0) -> None:
-        """Set the velocities of a run."""
-        if self.faces:
-            found = scene.domain.wall_velocities
-            self._rows.write(run * len(self.faces), [found[axis][side] for axis, side in self.faces])
-
-    def viewed(self, view: object) -> "MovingFaces":
-        return changed(self, first=view.w * len(self.faces))
-
-    @ti.func
-    def of(self, face: ti.template()):
-        """Return the velocity of a face by its index in `faces`."""
-        return self.velocity[self.first + face]
+        super().__init__(faces, ti.Vector.field(dimension, float, shape=runs * len(faces)) if faces else None)
 
 
-STILL = MovingFaces(())
+class RoughFaces(FaceNumbers):
+    """Coefficients of friction of the faces that have it (docs/theory.md, 3.4)."""
 
-
-def rough_faces(scene: Scene) -> tuple[tuple[int, int], ...]:
-    """Return (axis, side) of every face of a scene that has friction (docs/theory.md, 3.4)."""
-    found = scene.domain.frictions
-    return tuple((a, side) for a, pair in enumerate(found) for side in (0, 1) if pair[side] > 0)
-
-
-@ti.data_oriented
-class RoughFaces(Feature):
-    """Coefficients of friction of the rough faces. They are data, so that runs that differ in them share kernels.
-
-    Attributes:
-        faces: (axis, side) of every such face.
-        coefficient: coefficient of each face of each run.
-        first: row of the first face of the current run.
-    """
+    key = "frictions"
 
     def __init__(self, faces: Sequence[tuple[int, int]], runs: int = 1) -> None:
-        self.faces = tuple(faces)
-        self.first = 0
-        if faces:
-            self.coefficient = ti.field(float, shape=runs * len(self.faces))
-            self._rows = Rows(self.coefficient)
-
-    def write(self, scene: Scene, run: int = 0) -> None:
-        """Set the coefficients of a run."""
-        if self.faces:
-            found = scene.domain.frictions
-            self._rows.write(run * len(self.faces), [found[axis][side] for axis, side in self.faces])
-
-    def viewed(self, view: object) -> "RoughFaces":
-        return changed(self, first=view.w * len(self.faces))
-
-    @ti.func
-    def of(self, face: ti.template()):
-        """Return the coefficient of a face by its index in `faces`."""
-        return self.coefficient[self.first + face]
+        super().__init__(faces, ti.field(float, shape=runs * len(faces)) if faces else None)
 
 
-SMOOTH = RoughFaces(())
+STILL, SMOOTH = MovingFaces(()), RoughFaces(())
 
 
 def faces_on_grid(faces: Sequence[tuple[str, str]], settings: SolverSettings) -> tuple[tuple[str, str], ...]:

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 from mpmcli.boundaries.colliders import ColliderKind
-from mpmcli.boundaries.walls import moving_faces, rough_faces
+from mpmcli.boundaries.walls import MovingFaces, RoughFaces
 from mpmcli.materials.law import Law
 from mpmcli.scene import BodyParticles, Scene
 from mpmcli.scene.sampling import count_body
@@ -85,8 +85,8 @@ class CompiledKind:
             scene.solver.precision,
             scene.solver,
             tuple(tuple(pair) for pair in scene.domain.walls.faces(scene.dimension)),
-            rough_faces(scene),
-            moving_faces(scene),
+            RoughFaces.in_scene(scene),
+            MovingFaces.in_scene(scene),
             tuple((law.name, law.terms) for law in members),
             tuple(scene.domain.cells),
             # Rigid bodies alone have none, but fields have an entry.
