@@ -12,14 +12,8 @@ from command import run_here
 from drawn_results import WATER, frame, header, row
 from test_plot import drawn
 
-from mpmcli.check.result_check import (
-    ENERGY_SUSPECT,
-    ResultCheck,
-    check_result,
-    energy_change,
-    unsure_work,
-    work_of_colliders,
-)
+from mpmcli.check.collider_work import unsure_work, work_of_colliders
+from mpmcli.check.result_check import ENERGY_SUSPECT, ResultCheck, check_result, energy_change
 from mpmcli.output import SegmentStore
 from mpmcli.scene.colliders import Collider
 

@@ -11,7 +11,8 @@ import pytest
 from conftest import ROOT
 from contact_scenes import DENSITY, E, G, H, body, jelly, scene
 
-from mpmcli.check.result_check import HELD, check_kept, energy_change, work_of_colliders
+from mpmcli.check.collider_work import work_of_colliders
+from mpmcli.check.result_check import HELD, check_kept, energy_change
 from mpmcli.frames.frame import Frame
 from mpmcli.materials.registry import laws
 from mpmcli.output.header import RunHeader

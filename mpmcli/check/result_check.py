@@ -1,33 +1,25 @@
-"""`mpmcli check RESULT`: checks the stability of a run from its ledger and frames, and that it is complete.
-
-The result may be damaged. The balance of energy contains the work of colliders with prescribed motion.
-"""
+"""`mpmcli check RESULT`: checks the stability of a run from its ledger and frames, and that it is complete."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
-from itertools import count, pairwise
+from itertools import pairwise
 from math import isfinite
 from numbers import Real
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from mpmcli.check.finding import Finding, FrameFindings, Severity, Verdict, passes
+from mpmcli.check.collider_work import unsure_work, work_of_colliders
+from mpmcli.check.finding import Finding, FrameFindings, Verdict, passes
+from mpmcli.check.result_entries import RUN_AGAIN, Entry, OpenedResult, check_order, open_entries
 from mpmcli.check.result_state import BLOWN_UP, CRUSHED, CrowdCheck, MomentumCheck, StateCheck, StretchCheck
 from mpmcli.errors import InputError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
-from mpmcli.output.checksums import DamageError, first_line
-from mpmcli.output.durable import number_of
+from mpmcli.output.checksums import first_line
 from mpmcli.output.header import RunHeader
-from mpmcli.output.layout import PACKED, sealed_segments
-from mpmcli.output.result import open_result, result_place
-from mpmcli.output.run_record import DIED, ELSEWHERE, read_record, run_status
+from mpmcli.output.layout import PACKED
 from mpmcli.plain_json import finite_json
-from mpmcli.scene.colliders import Collider
-from mpmcli.scene.expression import evaluate
 from mpmcli.stability.limits import COURANT
 
 # Labels of the figures in text.
@@ -131,132 +123,6 @@ class ResultCheck:
         lines = [f"{self.path}: {self.verdict}{bad}{limit}"]
         lines += [f"  {words:<{width}}  {value}" for words, value in told.items()]
         return "\n".join([*lines, *(finding.line for finding in self.findings)])
-
-
-RUN_AGAIN = "Copy the file again from where it was made, or run the scene again."
-GO_ON = "mpmcli simulate --resume goes on with it."
-WAIT = "Wait for it, or run it again."
-# Tolerance of times, relative to the duration of the run.
-TIME_ERROR = 1e-9
-# Messages on a run that did not finish, by its status.
-GOES_ON = "The run has not ended; there are {far}, and "
-ENDS: dict[str, tuple[Severity, str, str, str]] = {
-    "unstable": ("error", "unstable-run", "After {far} {why}", "Change what the sentence names and run it again."),
-    "failed": ("error", "failed-run", "The run failed after {far}{told}", "Run it again."),
-    "interrupted": ("warning", "interrupted-run", "The run was interrupted after {far}", GO_ON),
-    "stopped": ("warning", "stopped-run", "The run stopped after {far}{told}", GO_ON),
-    DIED: ("warning", "died-run", "The run died after {far}: its process has ended without recording it", GO_ON),
-    "running": ("warning", "running", GOES_ON + "it goes on", WAIT),
-    ELSEWHERE: ("warning", "running", GOES_ON + "whether it continues cannot be determined", WAIT),
-}
-
-
-@dataclass(frozen=True)
-class Entry:
-    """A frame that is not read yet: its number, time, s, row of the ledger and number of particles."""
-
-    number: int
-    time: float
-    row: LedgerRow
-    count: int
-    # Reads the frame; InputError: it is damaged. None if it is not kept.
-    read: Callable[[], Frame] | None
-
-
-@dataclass(frozen=True)
-class OpenedResult:
-    """The readable part of a result, its frames in the order of the files."""
-
-    path: Path
-    # "packed", "segments", "memory", or "none" if nothing can be read.
-    kind: str
-    header: RunHeader
-    # Content of run.json, {} without one.
-    record: dict[str, Any]
-    entries: list[Entry]
-
-    @property
-    def status(self) -> str:
-        """Status of the run, see `run_status`."""
-        return run_status(_directory(self.path), self.record or None)
-
-    @property
-    def frames_expected(self) -> int | None:
-        """Number of frames of the whole run, None if it is not known."""
-        return self.record.get("frames_expected") or self.header.frames
-
-    @property
-    def last(self) -> int:
-        """Number of the last frame, -1 without any."""
-        return max((entry.number for entry in self.entries), default=-1)
-
-
-def open_entries(path: Path, findings: FrameFindings) -> OpenedResult:
-    """Open the readable part of a result, and report the rest; InputError: `path` is not a result of mpmcli.
-
-    Each segment is opened separately, so that damage to one does not affect the others.
-    """
-    path = result_place(path)
-    segments = sealed_segments(path) if path.is_dir() and not (path / PACKED).exists() else []
-    kind, header, entries = "segments" if segments else "none", RunHeader.read({}), []
-    for file in segments or [path]:
-        first = number_of(file) if segments else 0
-        try:
-            result = open_result(file)
-        except InputError as error:
-            if not segments and not _is_damage(path, error):
-                raise
-            which = f"The segment of frame {first} cannot be read ({{}})" if segments else "No frame can be read: {}"
-            findings.add("error", "unreadable", first, which.format(first_line(error)), RUN_AGAIN)
-            continue
-        header = header if entries else result.header
-        numbers = range(first, first + result.frame_count) if segments else result.numbers.tolist()
-        columns = zip(numbers, result.times.tolist(), result.ledger, result.particle_counts.tolist(), strict=True)
-        entries += [Entry(*facts, partial(result.frame, k)) for k, facts in enumerate(columns)]
-        path, kind = (path, kind) if segments else (result.path, result.kind)
-    return OpenedResult(path, kind, header, read_record(_directory(path)) or {}, entries)
-
-
-def _directory(path: Path) -> Path:
-    return path if path.is_dir() else path.parent
-
-
-def _is_damage(path: Path, error: InputError) -> bool:
-    """Return whether an unreadable file was written by mpmcli, so that it is damaged rather than of another kind."""
-    ours = read_record(_directory(path)) is not None
-    if path.is_dir() and not (path / PACKED).exists():
-        return ours  # a run that wrote no frame
-    # A cause is set if the file could not be read, and none if it is of another kind or version.
-    return isinstance(error, DamageError) or (ours and error.__cause__ is not None)
-
-
-def check_order(opened: OpenedResult, findings: FrameFindings) -> None:
-    """Check the times of the frames, that a finished run has all of them, and how the run ended."""
-    entries, expected, header = opened.entries, opened.frames_expected, opened.header
-    for entry in entries if header.end is not None and header.frames is not None else ():
-        planned = header.end * entry.number / (header.frames - 1)
-        if not abs(entry.time - planned) <= TIME_ERROR * header.end:
-            what = f"Frame {entry.number} is at {entry.time:.6g} s, where the scene has it at {planned:.6g} s"
-            findings.add("error", "frame-time", entry.number, what, RUN_AGAIN, value=entry.time)
-    # Frames missing at the end of a run that did not finish are reported by its status.
-    over = opened.record.get("status") in (None, "finished")
-    whole = expected if expected is not None and over else opened.last + 1
-    there = {entry.number for entry in entries} | findings.frames_of("unreadable")
-    missing = whole - sum(number < whole for number in there)
-    if missing and entries:
-        first = next(number for number in count() if number not in there)
-        named = f"Frame {first} is" if missing == 1 else f"Frame {first} and {missing - 1} more of {whole} are"
-        findings.add("error", "missing-frames", first, f"{named} missing", RUN_AGAIN, value=missing)
-    if not opened.record:
-        what = "No run.json lies beside the frames, so how the run ended is not known"
-        findings.add("note", "no-record", None, what, "Keep run.json together with the frames.")
-    elif opened.status in ENDS:
-        severity, rule, what, fix = ENDS[opened.status]
-        message = ((opened.record.get("failure") or {}).get("message") or "").rstrip(".")
-        written = opened.last + 1
-        far = f"{written} frames" if expected is None else f"{written} of {expected} frames"
-        what = what.format(far=far, why=message or "the run became unstable", told=message and f": {message}")
-        findings.add(severity, rule, written, what, fix)
 
 
 def check_result(path: Path, stop: Callable[[], bool] = lambda: False) -> ResultCheck:
@@ -495,50 +361,3 @@ def _volume_error(numbers: Sequence[int], errors: np.ndarray, findings: FrameFin
         fix = "Refine the domain. Of the materials, fluids with volume_correction and sand correct their volume."
         findings.add("note", "volume-error", first, what, fix, value=lasting)
     return lasting
-
-
-# Parts of the time between two frames in which the velocity of a collider is evaluated, and rows evaluated at once.
-PARTS, AT_ONCE = 64, 1000
-
-
-def work_of_colliders(rows: Sequence[LedgerRow], colliders: Sequence[Collider], *, sloped: bool = True) -> np.ndarray:
-    """Return the work of colliders on the material up to each frame, (T,), J.
-
-    Rows contain the mean load in the time before a frame. Within this time a load is linear, with the slope of the
-    means of the neighbouring rows, or constant, and the velocity is exact at the middles of `PARTS` parts.
-    """
-    times = np.array([row.time for row in rows])
-    spans, work = np.diff(times), np.zeros(len(rows))
-    if len(rows) < 2:
-        return work
-    middles = 0.5 * (times[1:] + times[:-1])
-    parts = (np.arange(PARTS) + 0.5) / PARTS - 0.5
-    for k, collider in enumerate(colliders):
-        if collider.driven:
-            loads = np.array([[*row.collider_force[k], *row.collider_torque[k]] for row in rows[1:]])
-            slopes = np.gradient(loads, middles, axis=0) if sloped and len(middles) > 1 else np.zeros_like(loads)
-            forces = len(collider.motion.velocity)
-            for first in range(0, len(middles), AT_ONCE):
-                own = slice(first, first + AT_ONCE)
-                offsets = parts * spans[own, None]
-                t = middles[own, None] + offsets
-                rates = [np.broadcast_to(evaluate(tree, {"t": t}), t.shape) for tree in collider.motion.rates]
-                turns = np.array([1.0]) if forces == 2 else np.array(collider.motion.axis)
-                for load, slope, rate in zip(
-                    [*loads[own].T[:forces], loads[own][:, forces:] @ turns],
-                    [*slopes[own].T[:forces], slopes[own][:, forces:] @ turns],
-                    rates,
-                    strict=True,
-                ):
-                    power = (load[:, None] + slope[:, None] * offsets) * rate
-                    work[1:][own] -= power.mean(axis=1) * spans[own]
-    return np.cumsum(work)
-
-
-def unsure_work(rows: Sequence[LedgerRow], colliders: Sequence[Collider]) -> np.ndarray:
-    """Return how far the work up to each frame is unsure, (T,), J: as far as it depends on the slopes of the loads.
-
-    These are not known where a collider starts or stops abruptly.
-    """
-    sure, linear = (work_of_colliders(rows, colliders, sloped=sloped) for sloped in (False, True))
-    return np.cumsum(np.abs(np.diff(linear - sure, prepend=0.0)))
