@@ -9,6 +9,7 @@ import pytest
 from solver_state import scene_of
 from test_colliders import run
 
+from mpmcli.boundaries.colliders import distances_of
 from mpmcli.scene import Scene
 
 G = 9.81
@@ -29,6 +30,27 @@ def prism(path: Path, outline: list[tuple[float, float]], depth: tuple[float, fl
     vertices = np.array([[x, y, z] for y in depth for x, z in outline])
     sides = [[k, (k + 1) % n + n * 0, (k + 1) % n + n, k + n] for k in range(n)]
     return write_mesh(path, vertices, [list(range(n)), list(range(n, 2 * n))[::-1], *[side[::-1] for side in sides]])
+
+
+def test_a_mesh_at_rest_is_sampled_in_the_domain_alone(tmp_path: Path) -> None:
+    """Of ground far larger than the domain, with exact distances; one that moves is sampled as a whole."""
+    h, top = 0.2, 0.3
+    ground = prism(tmp_path / "ground.stl", [(-1, -2), (2, -2), (2, top), (-1, top)], (-1, 2))
+    found = []
+    for velocity in ([0.0, 0.0, 0.0], [0.0, 0.0, 0.1]):
+        scene = scene_of(
+            domain={"size": [1.0] * 3, "spacing": h},
+            time={"end": 1.0, "frames": 1},
+            bodies=[{"name": "w", "material": "water", "shape": {"box": {"min": [0.4] * 3, "max": [0.6] * 3}}}],
+            colliders=[{"name": "c", "shape": {"mesh": {"file": ground}}, "velocity": velocity}],
+        )
+        found.append(distances_of(scene.colliders[0], scene.domain))
+    (values, origin, step), (whole, lowest, _) = found
+    last = origin + step * (np.array(values.shape) - 1)
+    assert (origin <= -2 * h + 1e-9).all() and (origin > -3 * h).all()
+    assert (last[:2] >= 1 + 2 * h - 1e-9).all() and (last < 1 + 3 * h).all() and last[2] >= top + 2 * h - 1e-9
+    assert values[4, 4] == pytest.approx(origin[2] + step * np.arange(values.shape[2]) - top, abs=1e-6)
+    assert (lowest <= -1 - 2 * h + 1e-9).all() and whole.size > 5 * values.size
 
 
 @pytest.mark.slow

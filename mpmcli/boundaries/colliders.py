@@ -18,6 +18,7 @@ from mpmcli.boundaries.rows import Rows
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
 from mpmcli.scene.colliders import Collider, Plane
+from mpmcli.scene.domain import Domain
 from mpmcli.scene.expression import evaluate
 from mpmcli.scene.primitives import Ball, Box, Capsule, Polygon
 from mpmcli.scene.quantity import AXES
@@ -71,8 +72,8 @@ class ColliderKind:
             tuple(sorted({form_code(collider) for collider in found})),
             tuple(k for k, collider in enumerate(found) if collider.driven),
             len(found),
-            sum(len(numbers_of(collider, h)) for collider in found),
-            sum(samples_of(collider.form, h)[0].size for collider in found if form_code(collider) == GRID),
+            sum(len(numbers_of(collider, scene.domain)) for collider in found),
+            sum(distances_of(collider, scene.domain)[0].size for collider in found if form_code(collider) == GRID),
             tuple(k for k, collider in enumerate(found) if collider.free),
             sum(len(contact_points(collider, h)) for collider in found if collider.free),
             any(collider.wall != "hold" for collider in found),
@@ -97,11 +98,18 @@ def form_code(collider: Collider) -> int:
     return FORMS.index(kind) if kind in FORMS and not around else GRID
 
 
-def numbers_of(collider: Collider, h: float) -> list[float]:
-    """Return the numbers of the form of a collider, relative to its pivot, in a scene with cells of h metres."""
+def distances_of(collider: Collider, domain: Domain) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return the sampled distances of a collider, see `samples_of`: if it is at rest, only in the domain."""
+    at_rest = not (collider.free or collider.motion.moves or collider.motion.angle)
+    within = (tuple(domain.origin), tuple(domain.upper)) if at_rest else ()
+    return samples_of(collider.form, domain.spacing, within)
+
+
+def numbers_of(collider: Collider, domain: Domain) -> list[float]:
+    """Return the numbers of the form of a collider, relative to its pivot."""
     d, pivot = len(collider.velocity), np.array(collider.center)
     if form_code(collider) == GRID:
-        return GridDistance.numbers(collider.form, pivot, h)
+        return GridDistance.numbers(pivot, *distances_of(collider, domain))
     return DISTANCES[type(collider.form)](d).numbers(collider.form, pivot)
 
 
@@ -210,7 +218,7 @@ class Colliders(Feature):
         used, sampled = run * self.kind.numbers, run * self.kind.samples
         rows, still = [], np.zeros((self.dimension, self.dimension))
         for collider in scene.colliders:
-            numbers = numbers_of(collider, h)
+            numbers = numbers_of(collider, scene.domain)
             self._write_numbers(used, np.array(numbers, self.real))
             place, turned = collider.motion.pose(0.0)
             held = [int(collider.axes is not None and axis not in collider.axes) for axis in AXES[: self.dimension]]
@@ -221,7 +229,7 @@ class Colliders(Feature):
             rows.append(row + [sampled] * self.grids + [np.eye(self.dimension)] * self.at_rest)
             used += len(numbers)
             if form_code(collider) == GRID:
-                values = samples_of(collider.form, h)[0].ravel()
+                values = distances_of(collider, scene.domain)[0].ravel()
                 self._write_samples(sampled, values)
                 sampled += values.size
         self._rows.write_all(run * self.capacity, rows)

@@ -236,12 +236,12 @@ DISTANCES = {
 
 
 @lru_cache(maxsize=8)
-def samples_of(form: Form, h: float) -> tuple[np.ndarray, np.ndarray, float]:
+def samples_of(form: Form, h: float, within: tuple = ()) -> tuple[np.ndarray, np.ndarray, float]:
     """Return the signed distances from a form in a scene with cells of h metres, see `distance_grid`."""
-    lower, upper = form.bounds()
+    lower, upper = np.clip(form.bounds(), *within) if within else form.bounds()
     cells = float(np.prod((upper - lower) / h + 2 * MARGIN))
     fine = FINE if cells * FINE ** len(lower) <= MANY else 1
-    return distance_grid(form, h / fine, MARGIN * h)
+    return distance_grid(form, h / fine, MARGIN * h, within)
 
 
 @ti.data_oriented
@@ -256,9 +256,8 @@ class GridDistance:
         self.dimension, self.samples = dimension, samples
 
     @staticmethod
-    def numbers(form: Form, pivot: np.ndarray, h: float) -> list[float]:
-        """Return the parameters for kernels, without the samples."""
-        values, origin, spacing = samples_of(form, h)
+    def numbers(pivot: np.ndarray, values: np.ndarray, origin: np.ndarray, spacing: float) -> list[float]:
+        """Return the parameters for kernels of a grid with these samples."""
         return [*(origin - pivot), spacing, *map(float, values.shape)]
 
     @ti.func
