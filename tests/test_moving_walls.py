@@ -10,12 +10,14 @@ from mpmcli.scene import Scene
 from mpmcli.solver.engine.run import build_run
 from mpmcli.stability.limits import COURANT
 
-SOLID = {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 2e4, "poissons_ratio": 0.3}
+# DT is 0.70 to 0.85 of the bound by stiffness, and twice that by speed of a body that moves by a cell in it. In both
+# frames it counts as a whole own step, and AFLIP keeps the same share (docs/theory.md, 2.3).
+SOLID = {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 4e4, "poissons_ratio": 0.3}
 H, DT = 0.125, 0.01
 # By name: walls, friction, and settings of the solver.
 BLOCKS = {
     "stick": ("stick", 0.0, {}),
-    "rough": ("separate", 0.3, {}),
+    "rough, aflip": ("separate", 0.3, {"transfer": "aflip"}),
     "rough, slip": ("slip", 0.3, {}),
     "stick, aflip": ("stick", 0.0, {"transfer": "aflip"}),
 }
@@ -48,7 +50,7 @@ def pressed_block(name: str, speed: float) -> Scene:
 
 
 @pytest.mark.parametrize(
-    "name", [name if name == "rough" else pytest.param(name, marks=pytest.mark.slow) for name in BLOCKS]
+    "name", [name if name == "rough, aflip" else pytest.param(name, marks=pytest.mark.slow) for name in BLOCKS]
 )
 def test_a_moving_wall_is_one_at_rest_in_its_own_frame(
     backend_of: Callable, name: str, record_property: Callable
