@@ -175,17 +175,17 @@ def test_plastic_flow_is_as_far_at_any_step(backend_of: Callable, name: str) -> 
     ("name", "n", "measure", "tolerance"),
     [
         pytest.param("two_disks", 20, "energy loss", 0.05, marks=pytest.mark.slow),
-        pytest.param("conservation_contact", 8, "energy loss", 0.02, marks=pytest.mark.slow),
+        pytest.param("conservation_contact", 16, "energy loss", 0.02, marks=pytest.mark.slow),
         pytest.param("conservation", 8, "energy loss", 0.02, marks=pytest.mark.slow),
         pytest.param("taylor_green", 16, "decay error", 0.05, marks=pytest.mark.slow),
         pytest.param("dam_break", 16, "front error", 0.05, marks=pytest.mark.slow),
         pytest.param("bar_fixed_fixed", 13, "energy loss", 0.05, marks=pytest.mark.slow),
         pytest.param("bar_fixed_free", 13, "energy loss", 0.2, marks=pytest.mark.slow),
-        pytest.param("spinning_disc", 4, "energy loss", 0.35, marks=pytest.mark.slow),
+        pytest.param("spinning_disc", 8, "energy loss", 0.1, marks=pytest.mark.slow),
     ],
 )
 def test_the_table_of_what_steps_lose(backend_of: Callable, name: str, n: int, measure: str, tolerance: float) -> None:
-    """Of docs/theory.md, 2.3: what validation cases lose in steps of 1, 1/5 and 1/50."""
+    """Of docs/theory.md, 2.3: what validation cases lose in steps of 1, 1/5 and 1/50; differences fall with h."""
     case, lost = all_cases()[name], []
     for part in (1, 5, 50):
         scene = scene_of_case(case, n, Setting(safety=0.8 / part))
