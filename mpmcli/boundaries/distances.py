@@ -237,11 +237,11 @@ DISTANCES = {
 
 @lru_cache(maxsize=8)
 def samples_of(form: Form, h: float, within: tuple = ()) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return the signed distances from a form in a scene with cells of h metres, see `distance_grid`."""
-    lower, upper = np.clip(form.bounds(), *within) if within else form.bounds()
-    cells = float(np.prod((upper - lower) / h + 2 * MARGIN))
-    fine = FINE if cells * FINE ** len(lower) <= MANY else 1
-    return distance_grid(form, h / fine, MARGIN * h, within)
+    """Return the distances from a form, in the box `within`, in a scene with cells of h metres; see `distance_grid`."""
+    box = np.clip(form.bounds(), *within) if within else form.bounds()
+    cells = float(np.prod((box[1] - box[0]) / h + 2 * MARGIN))
+    fine = FINE if cells * FINE ** len(box[0]) <= MANY else 1
+    return distance_grid(form, h / fine, MARGIN * h, box)
 
 
 @ti.data_oriented

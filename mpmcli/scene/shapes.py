@@ -315,22 +315,22 @@ _NODES_AT_ONCE = 500_000
 
 
 def distance_grid(
-    form: Form, spacing: float, margin: float, within: Sequence[Sequence[float]] = ()
+    form: Form, spacing: float, margin: float, box: Sequence[np.ndarray] = ()
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return the signed distance from a form on a grid that covers its bounding box and a margin around it.
+    """Return the signed distance from a form on a grid that covers a box and a margin around it.
 
     Args:
         form: any form of a shape.
         spacing: of the nodes, m.
-        margin: m; the grid reaches at least as far beyond the bounding box.
-        within: lower and upper corner of a box, m, of which the grid covers no more than the margin; all by default.
+        margin: m; the grid reaches at least as far beyond the box.
+        box: lower and upper corner, m; by default the bounding box of the form.
 
     Returns:
         values: float32, (n1, ..., nd), m, negative inside; for a mesh see `ClosedSurface.signed_distance`.
         origin: place of the first node, (d,), m.
         spacing: as given; node i lies at origin + i spacing.
     """
-    lower, upper = np.clip(form.bounds(), *within) if within else form.bounds()
+    lower, upper = box if len(box) else form.bounds()
     cells = np.ceil((upper - lower + 2 * margin) / spacing - 1e-9).astype(int)
     shape = tuple(int(n) for n in np.maximum(cells, 1) + 1)
     origin = (lower + upper - (np.array(shape) - 1) * spacing) / 2
