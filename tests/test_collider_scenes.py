@@ -9,7 +9,7 @@ import pytest
 from solver_state import scene_of
 from test_colliders import run
 
-from mpmcli.boundaries.colliders import distances_of
+from mpmcli.boundaries.colliders import parts_of
 from mpmcli.scene import Scene
 
 G = 9.81
@@ -44,7 +44,8 @@ def test_a_mesh_at_rest_is_sampled_in_the_domain_alone(tmp_path: Path) -> None:
             bodies=[{"name": "w", "material": "water", "shape": {"box": {"min": [0.4] * 3, "max": [0.6] * 3}}}],
             colliders=[{"name": "c", "shape": {"mesh": {"file": ground}}, "velocity": velocity}],
         )
-        found.append(distances_of(scene.colliders[0], scene.domain))
+        (part,) = parts_of(scene.colliders[0], scene.domain)
+        found.append((part.samples, np.array(part.numbers[:3]) + scene.colliders[0].center, part.numbers[3]))
     (values, origin, step), (whole, lowest, _) = found
     last = origin + step * (np.array(values.shape) - 1)
     assert (origin <= -2 * h + 1e-9).all() and (origin > -3 * h).all()

@@ -94,6 +94,10 @@ def test_a_container_has_its_material_inside() -> None:
         ({"angle": "log(t)"}, "colliders[0].angle: must be finite"),
         ({"shape": {}}, "colliders[0].shape: needs exactly one of"),
         ({"shape": {"plane": {"point": [0, 0], "normal": [0, 0]}}}, "must have a direction"),
+        (
+            {"shape": {"plane": {"point": [0, 0], "normal": [0, 1]}, "subtract": [BALL]}},
+            "colliders[0].shape.plane: is a shape alone; leave add and subtract out",
+        ),
         ({"shape": {"ball": {"center": [50.0, 0.5], "radius": 10.0}}}, '"c0" (20 x 20 m) lies outside of the domain'),
         (
             {"shape": {"polygon": {"vertices": [[0, -1e9], [0.1, -1e9], [0.1, 0.1]]}}},

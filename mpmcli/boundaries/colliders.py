@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mpmcli.boundaries.distances import DISTANCES, BoxDistance, GridDistance, samples_of
+from mpmcli.boundaries.distances import DISTANCES, BoxDistance, GridDistance, direction_of, samples_of
 from mpmcli.boundaries.doubles import double_field
 from mpmcli.boundaries.feature import Feature, Phase, changed
 from mpmcli.boundaries.loads import Loads
@@ -20,8 +20,9 @@ from mpmcli.scene import Scene
 from mpmcli.scene.colliders import Collider, Plane
 from mpmcli.scene.domain import Domain
 from mpmcli.scene.expression import evaluate
-from mpmcli.scene.primitives import Ball, Box, Capsule, Polygon
+from mpmcli.scene.primitives import Ball, Box, Capsule, Polygon, Solid
 from mpmcli.scene.quantity import AXES
+from mpmcli.scene.shapes import Composite, clauses_of
 from mpmcli.scene.surface import form_surface, surface_points
 
 # Distance in cells outside a surface up to which it acts on nodes. The outermost of these nodes lies between a quarter
@@ -35,6 +36,12 @@ DEEP, DEEP_STICKING = -0.76, -1.25
 PROBE, WITHIN = 0.75, 0.2
 # Depth in cells from which particles that drift in are moved out.
 SUNK = 0.2
+# Distance in cells from a composite up to which its parts are looked at, and that from a face to the points beside it
+# that tell whether the face is a surface of the whole.
+SEAMS, BESIDE = 2.0, 0.05
+# Width in cells over which the faces of a corner blend, at most NEAR cells from them, and the largest cosine between
+# them.
+WIDE, NEAR, CORNER = 0.35, 0.6, 0.8
 # Codes of the conditions of surfaces.
 SLIP, STICK, SEPARATE, HOLD = range(4)
 WALLS = {"slip": SLIP, "stick": STICK, "separate": SEPARATE, "hold": HOLD}
@@ -46,6 +53,8 @@ LOOSE, PRESSED, HELD = range(3)
 FORMS = tuple(DISTANCES)
 # Code of all other forms, with distances on a grid.
 GRID = len(FORMS)
+# Simple forms up to which composites are taken apart; others are sampled.
+MOST_PARTS = 64
 BOX = FORMS.index(Box)
 # 2 pi in two parts, because literals have the precision of particles: the first is exact, the second to 1e-10.
 TURN = (6.28125, 2 * math.pi - 6.28125)
@@ -57,26 +66,33 @@ class ColliderKind:
 
     forms: tuple[int, ...]  # indices into FORMS of the forms that occur, in order, GRID among them
     moving: tuple[int, ...]  # indices of the colliders that move
-    count: int  # upper bounds: of the colliders, and of the numbers and the samples of their forms
+    count: int  # upper bounds: of the colliders, of their parts, and of the numbers and the samples of these
+    parts: int
     numbers: int
     samples: int
     free: tuple[int, ...] = ()  # indices of the colliders that move freely
     points: int = 0  # number of points on the surfaces of free colliders
     touched: bool = False  # whether any does not hold
+    cornered: bool = False  # whether any has corners, and whether any has several parts
+    combined: bool = False
 
     @staticmethod
     def of(scene: Scene) -> "ColliderKind":
         """Return the kind of the colliders of a scene."""
         found, h = scene.colliders, scene.domain.spacing
+        parts = [part for collider in found for part in parts_of(collider, scene.domain)]
         return ColliderKind(
-            tuple(sorted({form_code(collider) for collider in found})),
+            tuple(sorted({part.code for part in parts})),
             tuple(k for k, collider in enumerate(found) if collider.driven),
             len(found),
-            sum(len(numbers_of(collider, scene.domain)) for collider in found),
-            sum(distances_of(collider, scene.domain)[0].size for collider in found if form_code(collider) == GRID),
+            len(parts),
+            sum(len(part.numbers) for part in parts),
+            sum(part.samples.size for part in parts if part.samples is not None),
             tuple(k for k, collider in enumerate(found) if collider.free),
             sum(len(contact_points(collider, h)) for collider in found if collider.free),
             any(collider.wall != "hold" for collider in found),
+            any(has_corners(collider) for collider in found),
+            len(parts) > len(found),
         )
 
     def joined(self, other: "ColliderKind") -> "ColliderKind | None":
@@ -86,31 +102,57 @@ class ColliderKind:
         if (self.count > 0) != (other.count > 0):
             return None
         forms = tuple(sorted({*self.forms, *other.forms}))
-        rooms = (max(getattr(self, name), getattr(other, name)) for name in ("count", "numbers", "samples"))
-        return ColliderKind(forms, self.moving, *rooms, self.free, max(self.points, other.points), self.touched)
+        rooms = (max(getattr(self, name), getattr(other, name)) for name in ("count", "parts", "numbers", "samples"))
+        either = (getattr(self, name) or getattr(other, name) for name in ("cornered", "combined"))
+        return ColliderKind(
+            forms, self.moving, *rooms, self.free, max(self.points, other.points), self.touched, *either
+        )
 
 
-def form_code(collider: Collider) -> int:
-    """Return the index of the form of a collider in FORMS, or GRID."""
-    kind = type(collider.form)
-    # In the corners of a polygon around the material, the normals of a grid follow both edges.
-    around = kind is Polygon and collider.side == "inside"
-    return FORMS.index(kind) if kind in FORMS and not around else GRID
+def has_corners(collider: Collider) -> bool:
+    """Return whether the surface of a collider may have corners around the material, a box around it aside."""
+    if not isinstance(collider.form, Polygon):
+        return isinstance(collider.form, Composite)
+    edges = np.diff(form_surface(collider.form).chains()[0], axis=0)
+    ahead = np.roll(edges, -1, axis=0) if collider.side == "inside" else np.roll(edges, 1, axis=0)
+    turns = edges[:, 0] * ahead[:, 1] - edges[:, 1] * ahead[:, 0]
+    sharp = (edges * ahead).sum(axis=1) < CORNER * np.hypot(*edges.T) * np.hypot(*ahead.T)
+    return bool(np.any(sharp & (turns > 0)))
 
 
-def distances_of(collider: Collider, domain: Domain) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return the sampled distances of a collider, see `samples_of`: if it is at rest, only in the domain."""
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A simple form of a collider, see `clauses_of`."""
+
+    code: int  # index in FORMS, or GRID
+    sign: int
+    ends: bool  # whether it is the last of its clause
+    numbers: list[float]  # relative to the pivot of the collider
+    samples: np.ndarray | None  # distances at the nodes of a grid
+
+
+def parts_of(collider: Collider, domain: Domain) -> list[Part]:
+    """Return the parts of a collider, clause by clause."""
+    clauses = clauses_of(collider.form)
+    if sum(map(len, clauses)) > MOST_PARTS:
+        clauses = [((collider.form, 1),)]
+    pivot = np.array(collider.center)
+    return [
+        _part(form, sign, k == len(clause) - 1, pivot, collider, domain)
+        for clause in clauses
+        for k, (form, sign) in enumerate(clause)
+    ]
+
+
+def _part(form: Solid, sign: int, ends: bool, pivot: np.ndarray, collider: Collider, domain: Domain) -> Part:
+    if type(form) in FORMS:
+        numbers = DISTANCES[type(form)](len(pivot)).numbers(form, pivot)
+        return Part(FORMS.index(type(form)), sign, ends, numbers, None)
+    # A collider at rest is sampled only in the domain.
     at_rest = not (collider.free or collider.motion.moves or collider.motion.angle)
     within = (tuple(domain.origin), tuple(domain.upper)) if at_rest else ()
-    return samples_of(collider.form, domain.spacing, within)
-
-
-def numbers_of(collider: Collider, domain: Domain) -> list[float]:
-    """Return the numbers of the form of a collider, relative to its pivot."""
-    d, pivot = len(collider.velocity), np.array(collider.center)
-    if form_code(collider) == GRID:
-        return GridDistance.numbers(pivot, *distances_of(collider, domain))
-    return DISTANCES[type(collider.form)](d).numbers(collider.form, pivot)
+    sampled = samples_of(form, domain.spacing, within)
+    return Part(GRID, sign, ends, GridDistance.numbers(pivot, *sampled), sampled[0])
 
 
 def contact_points(collider: Collider, h: float) -> np.ndarray:
@@ -184,10 +226,13 @@ class Colliders(Feature):
         if self.grids:
             self.samples = ti.field(ti.f32, shape=runs * kind.samples)
             self.grid_distance = GridDistance(d, self.samples)
-            self.sample = ti.field(int, shape=n)
-        # Of each: form, condition of the surface, index of its first parameter, and -1 for a container, else 1.
-        self.form, self.wall = ti.field(int, shape=n), ti.field(int, shape=n)
-        self.begin, self.side = ti.field(int, shape=n), ti.field(int, shape=n)
+        # Of each part: form, indices of its first number and its first sample, sign, and whether it ends a clause.
+        columns = (ti.field(int, shape=runs * kind.parts) for _ in range(5))
+        self.form, self.begin, self.sample, self.sign, self.ends = columns
+        # Of each: index of its first part and of the first one of the next, condition of the surface, -1 for a
+        # container, else 1, number of faces that act in turn, and whether the faces of corners blend, 1 or 0.
+        self.parts = ti.Vector.field(2, int, shape=n)
+        self.wall, self.side, self.faces, self.corners = (ti.field(int, shape=n) for _ in range(4))
         self.friction = ti.field(float, shape=n)
         # Whether it may be thin somewhere, 1 or 0.
         self.slender = ti.field(int, shape=n)
@@ -203,10 +248,11 @@ class Colliders(Feature):
         self.velocity = ti.Vector.field(d, float, shape=n)
         self.turning = ti.Matrix.field(d, d, float, shape=n)
         self.count, self._counts = ti.field(int, shape=runs), [0] * runs
-        fields = [self.form, self.wall, self.begin, self.side, self.friction, self.slender, self.lets, self.place]
-        fields += [self.turned, self.reach, self.velocity, self.turning] + ([self.sample] if self.grids else [])
+        fields = [self.parts, self.wall, self.side, self.faces, self.corners, self.friction, self.slender, self.lets]
+        fields += [self.place, self.turned, self.reach, self.velocity, self.turning]
         fields += [self.carried] if at_rest else []
         self._rows, self._count = Rows(*fields), Rows(self.count)
+        self._parts = Rows(self.form, self.begin, self.sample, self.sign, self.ends)
         self.deterministic = deterministic
         self.given = ti.Vector.field(d, float, shape=n * math.prod(shape)) if deterministic else None
 
@@ -215,24 +261,29 @@ class Colliders(Feature):
         h, origin = scene.domain.spacing, np.array(scene.domain.origin)
         self._counts[run] = len(scene.colliders)
         self._count.write(run, [len(scene.colliders)])
-        used, sampled = run * self.kind.numbers, run * self.kind.samples
-        rows, still = [], np.zeros((self.dimension, self.dimension))
+        used, sampled, first = run * self.kind.numbers, run * self.kind.samples, run * self.kind.parts
+        rows, table, still = [], [], np.zeros((self.dimension, self.dimension))
         for collider in scene.colliders:
-            numbers = numbers_of(collider, scene.domain)
-            self._write_numbers(used, np.array(numbers, self.real))
+            begin, parts = first + len(table), parts_of(collider, scene.domain)
+            for part in parts:
+                table.append([part.code, used, sampled, part.sign, part.ends])
+                self._write_numbers(used, np.array(part.numbers, self.real))
+                used += len(part.numbers)
+                if part.samples is not None:
+                    self._write_samples(sampled, GridDistance.coefficients(part.samples).ravel())
+                    sampled += part.samples.size
             place, turned = collider.motion.pose(0.0)
             held = [int(collider.axes is not None and axis not in collider.axes) for axis in AXES[: self.dimension]]
             side = -1 if collider.side == "inside" else 1
+            # At the edges of a box around the material several faces touch it at once; elsewhere the nearest suffices.
+            faces = self.dimension if side < 0 and isinstance(collider.form, Box) else 1
             thin = int(slender(collider, h))
-            row = [form_code(collider), WALLS[collider.wall], used, side, collider.friction, thin, held]
-            row += [place - origin, turned, reach_of(collider, h), still[0], still]
-            rows.append(row + [sampled] * self.grids + [np.eye(self.dimension)] * self.at_rest)
-            used += len(numbers)
-            if form_code(collider) == GRID:
-                values = distances_of(collider, scene.domain)[0].ravel()
-                self._write_samples(sampled, values)
-                sampled += values.size
+            corners = int(has_corners(collider))
+            row = [[begin, begin + len(parts)], WALLS[collider.wall], side, faces, corners, collider.friction, thin]
+            row += [held, place - origin, turned, reach_of(collider, h), still[0], still]
+            rows.append(row + [np.eye(self.dimension)] * self.at_rest)
         self._rows.write_all(run * self.capacity, rows)
+        self._parts.write_all(first, table)
         self.loads.clear(run)
 
     def saved(self) -> dict[str, ti.Field]:
@@ -414,43 +465,143 @@ class Colliders(Feature):
 
     @ti.func
     def faces_of(self, i: int):
-        """Return the number of faces of collider i that act in turn: one per axis for a box around the material.
-
-        At its edges the material touches several faces at once; elsewhere the nearest point of a surface suffices.
-        """
+        """Return the number of faces of collider i that act in turn."""
         count = 1
         if ti.static(self.boxes):
-            if self.form[i] == BOX and self.side[i] < 0:
-                # `count = ti.static(...)` would define a constant, and not assign the variable.
-                count += ti.static(self.dimension - 1)
+            count = self.faces[i]
         return count
 
     @ti.func
     def distance(self, i: int, arm: ti.template(), face: int):
         """Return the distance of a position from a face of collider i, m, and the normal into the material."""
-        d = ti.static(self.dimension)
-        y = self.turned[i].transpose() @ arm
-        phi, own = 1e30, ti.Vector.zero(float, d)
-        for code, form in ti.static(self.distances):
-            if self.form[i] == code:
-                found, normal = form.at(self.numbers, self.begin[i], y)
-                phi = found
-                for a in ti.static(range(d)):
-                    own[a] = normal[a]
+        y, side = self.turned[i].transpose() @ arm, ti.cast(self.side[i], float)
+        phi, own = 1e30, ti.Vector.zero(float, self.dimension)
+        if ti.static(self.kind.cornered):
+            phi, own = self.distance_with_corners(i, y, side)
+        else:
+            phi, own = self.distance_of_part(self.parts[i][0], y)
         if ti.static(self.boxes):
-            if self.faces_of(i) > 1:
-                found, normal = self.box.face(self.numbers, self.begin[i], y, face)
-                phi = found
-                for a in ti.static(range(d)):
-                    own[a] = normal[a]
-        if ti.static(self.grids):
-            if self.form[i] == GRID:
-                found, normal = self.grid_distance.at(self.numbers, self.begin[i], self.sample[i], y)
-                phi = found
-                for a in ti.static(range(d)):
-                    own[a] = normal[a]
-        side = ti.cast(self.side[i], float)
+            if self.faces[i] > 1:
+                phi, own = self.box.face(self.numbers, self.begin[self.parts[i][0]], y, face)
         return side * phi, side * (self.turned[i] @ own)
+
+    @ti.func
+    def distance_with_corners(self, i: int, y: ti.template(), side: float):
+        """Return the signed distance of y from collider i, m, and the normal, blended in corners around the material.
+
+        Their other face is the nearest one at a place beside y.
+        """
+        phi, normal = 0.0, ti.Vector.zero(float, self.dimension)
+        other, slope, least = 0.0, normal, CORNER
+        for k in range(ti.static(2 * self.dimension - 1)):
+            if k == 0 or (self.corners[i] == 1 and ti.abs(phi) < NEAR * self.spacing):
+                way = ti.Vector.zero(float, self.dimension)
+                if k > 0:
+                    way = self.tangent(normal, (k - 1) // 2) * ti.cast(2 * (k % 2) - 1, float)
+                place = y + WIDE * self.spacing * way
+                found, own = self.distance_of_whole(i, place)
+                if ti.static(self.kind.combined):
+                    if self.parts[i][1] - self.parts[i][0] > 1 and ti.abs(found) < SEAMS * self.spacing:
+                        found, own = self.without_seams(i, place, found, own)
+                if k == 0:
+                    phi, normal = found, own
+                elif side * own.dot(way) < 0.0 and own.dot(normal) < least:
+                    least, slope, other = own.dot(normal), own, found - WIDE * self.spacing * own.dot(way)
+        apart = side * (other - phi) / (WIDE * self.spacing)
+        if least < CORNER and ti.abs(apart) < 1.0:
+            share = 0.5 + 0.5 * apart
+            phi = share * phi + (1.0 - share) * other
+            blend = share * normal + (1.0 - share) * slope
+            normal = direction_of(blend, blend.norm(), normal)
+        return phi, normal
+
+    @ti.func
+    def tangent(self, normal: ti.template(), k: int):
+        """Return the k-th unit vector normal to a unit vector."""
+        result = ti.Vector.zero(float, self.dimension)
+        if ti.static(self.dimension == 2):
+            result[0], result[1] = -normal[1], normal[0]
+        else:
+            # Beside the axis that it is farthest from.
+            a = 0
+            for b in ti.static(range(1, 3)):
+                if ti.abs(normal[b]) < ti.abs(normal[0]) and (b == 1 or ti.abs(normal[b]) < ti.abs(normal[1])):
+                    a = b
+            axis = ti.Vector([ti.cast(a == b, float) for b in range(3)])
+            result = axis.cross(normal).normalized()
+            if k == 1:
+                result = result.cross(normal)
+        return result
+
+    @ti.func
+    def distance_of_whole(self, i: int, y: ti.template()):
+        """Return the maximum over clauses of the least distance of y from a part of collider i, m, and its normal."""
+        phi, own = -1e30, ti.Vector.zero(float, self.dimension)
+        least, nearest = 1e30, own
+        for q in range(self.parts[i][0], self.parts[i][1]):
+            found, normal = self.distance_of_part(q, y)
+            if found < least:
+                least, nearest = found, normal
+            if self.ends[q] == 1:
+                if least > phi:
+                    phi, own = least, nearest
+                least = 1e30
+        return phi, own
+
+    @ti.func
+    def without_seams(self, i: int, y: ti.template(), phi: float, own: ti.template()):
+        """Return the distance from the nearest part whose surface is there a surface of the whole, m, and the normal.
+
+        Where parts meet or end at the same face, the whole is on both sides of it, or on neither. If no part is near,
+        they are those of the edge at which the surfaces of two parts, taken as planes, meet.
+        """
+        first, last, normal, size = self.parts[i][0], self.parts[i][1], own, phi
+        far, step = SEAMS * self.spacing, BESIDE * self.spacing
+        least, direction, side, edge = far, own, 1.0, False
+        beyond, other = far, own
+        q = first - 1
+        while q < last:
+            if q >= first:
+                size, normal = self.distance_of_part(q, y)
+            if ti.abs(size) < least:
+                behind, ahead = 0.0, 0.0
+                for k in range(2):
+                    behind = ahead
+                    place = y + (ti.cast(2 * k - 1, float) * step - size) * normal
+                    ahead, _normal = self.distance_of_whole(i, place)
+                real = ahead - behind > 0.5 * step and behind < 0.25 * step and ahead > -0.25 * step
+                if q < first:
+                    # Rounding must not choose the side of a seam.
+                    edge = ti.max(ti.abs(behind), ti.abs(ahead)) > 1.5 * step
+                    side = ti.select(ti.select(real or edge, phi, ahead) < 0.0, -1.0, 1.0)
+                if real:
+                    least, direction = ti.abs(size), ti.select(size * side < 0.0, -1.0, 1.0) * normal
+                    q = ti.select(q < first, last, q)
+                elif size * side > 0.0 and ti.abs(size) < beyond and ti.abs(normal.dot(own)) < 0.99:
+                    beyond, other = ti.abs(size), normal
+            q += 1
+        if edge and least == far and beyond < far:
+            along = own.dot(other)
+            offset = (ti.abs(phi) - along * beyond) * own + (beyond - along * ti.abs(phi)) * other
+            offset /= 1.0 - along * along
+            off, _normal = self.distance_of_whole(i, y - side * offset)
+            if ti.abs(off) < 0.1 * self.spacing and offset.norm() < far:
+                least = offset.norm()
+                direction = direction_of(offset, least, own)
+        return side * least, direction
+
+    @ti.func
+    def distance_of_part(self, q: int, y: ti.template()):
+        """Return the signed distance of y from part q of a collider, m, or from its complement, and the normal."""
+        phi, own = 1e30, ti.Vector.zero(float, self.dimension)
+        for code, form in ti.static(self.distances):
+            if self.form[q] == code:
+                phi, own = form.at(self.numbers, self.begin[q], y)
+        if ti.static(self.grids):
+            if self.form[q] == GRID:
+                phi, own = self.grid_distance.at(self.numbers, self.begin[q], self.sample[q], y)
+        sign = ti.cast(self.sign[q], float)
+        return sign * phi, sign * own
 
     @ti.func
     def met(self, i: int, arm: ti.template(), normal: ti.template(), velocity: ti.template()):

@@ -10,7 +10,7 @@ import numpy as np
 
 from mpmcli.quick_taichi import ti
 from mpmcli.scene.colliders import Plane
-from mpmcli.scene.primitives import Ball, Box, Capsule, Cylinder, Polygon
+from mpmcli.scene.primitives import Ball, Box, Capsule, Cylinder, Polygon, TurnedBox
 from mpmcli.scene.shapes import Form, distance_grid
 from mpmcli.scene.surface import ring
 
@@ -78,20 +78,28 @@ class BoxDistance(Distance):
     @ti.func
     def at(self, numbers: ti.template(), first: int, y: ti.template()):
         d = ti.static(self.dimension)
+        own = y
+        for a in ti.static(range(d)):
+            own[a] = y[a] - numbers[first + a]
+        return self.around(numbers, first + d, own)
+
+    @ti.func
+    def around(self, numbers: ti.template(), first: int, y: ti.template()):
+        """Return the signed distance of y from a box about 0 whose half lengths begin at `first`, and the normal."""
+        d = ti.static(self.dimension)
         side = ti.Vector.zero(float, d)
         beyond = ti.Vector.zero(float, d)
         nearest = ti.Vector.zero(float, d)
         deepest, square = -1e30, 0.0
         for a in ti.static(range(d)):
-            from_center = y[a] - numbers[first + a]
-            out = ti.abs(from_center) - numbers[first + d + a]
-            side[a] = 1.0 if from_center >= 0 else -1.0
+            out = ti.abs(y[a]) - numbers[first + a]
+            side[a] = 1.0 if y[a] >= 0 else -1.0
             beyond[a] = ti.max(out, 0.0) * side[a]
             square += beyond[a] ** 2
             deepest = ti.max(deepest, out)
         found = False
         for a in ti.static(range(d)):
-            out = ti.abs(y[a] - numbers[first + a]) - numbers[first + d + a]
+            out = ti.abs(y[a]) - numbers[first + a]
             if not found and out == deepest:
                 nearest[a] = side[a]
                 found = True
@@ -112,6 +120,28 @@ class BoxDistance(Distance):
                 out = ti.abs(from_center) - numbers[first + self.dimension + a]
                 normal[a] = 1.0 if from_center >= 0 else -1.0
         return out, normal
+
+
+@ti.data_oriented
+class TurnedBoxDistance(Distance):
+    """A box in any direction: its middle, its half lengths, and its rotation by rows."""
+
+    def __init__(self, dimension: int) -> None:
+        super().__init__(dimension)
+        self.box = BoxDistance(dimension)
+
+    def numbers(self, form: TurnedBox, pivot: np.ndarray) -> list[float]:
+        return [*(np.array(form.middle) - pivot), *form.half, *np.ravel(form.turn)]
+
+    @ti.func
+    def at(self, numbers: ti.template(), first: int, y: ti.template()):
+        offset, turn = y, ti.Matrix.zero(float, 3, 3)
+        for a in ti.static(range(3)):
+            offset[a] = y[a] - numbers[first + a]
+            for b in ti.static(range(3)):
+                turn[a, b] = numbers[first + 6 + 3 * a + b]
+        phi, normal = self.box.around(numbers, first + 3, turn.transpose() @ offset)
+        return phi, turn @ normal
 
 
 @ti.data_oriented
@@ -232,6 +262,7 @@ DISTANCES = {
     Capsule: CapsuleDistance,
     Cylinder: CylinderDistance,
     Polygon: PolygonDistance,
+    TurnedBox: TurnedBoxDistance,
 }
 
 
@@ -246,10 +277,10 @@ def samples_of(form: Form, h: float, within: tuple = ()) -> tuple[np.ndarray, np
 
 @ti.data_oriented
 class GridDistance:
-    """A mesh, union or difference of forms, by distances at the nodes of a grid with multilinear interpolation.
+    """A mesh, by a quadratic spline through its distances at the nodes of a grid; its gradient is continuous.
 
-    Its parameters are the first node, the spacing, and the nodes per axis. Outside the grid the distance to the grid is
-    added.
+    Its parameters are the first node, the spacing, and the nodes per axis. Outside the grid, without its outermost half
+    cell, the distance to the grid is added.
     """
 
     def __init__(self, dimension: int, samples: ti.Field) -> None:
@@ -257,44 +288,46 @@ class GridDistance:
 
     @staticmethod
     def numbers(pivot: np.ndarray, values: np.ndarray, origin: np.ndarray, spacing: float) -> list[float]:
-        """Return the parameters for kernels of a grid with these samples."""
+        """Return the parameters for kernels of a grid with these distances."""
         return [*(origin - pivot), spacing, *map(float, values.shape)]
+
+    @staticmethod
+    def coefficients(values: np.ndarray) -> np.ndarray:
+        """Return the coefficients of the spline through the distances, float32, of the same shape."""
+        from scipy.ndimage import spline_filter
+
+        return spline_filter(values, order=2, output=np.float32)
 
     @ti.func
     def at(self, numbers: ti.template(), first: int, sample: int, y: ti.template()):
-        """Return the signed distance of y from the form, and the normal; its samples begin at `sample`."""
+        """Return the signed distance of y from the form, and the normal; its coefficients begin at `sample`."""
         d = ti.static(self.dimension)
         spacing = numbers[first + d]
         base = ti.Vector.zero(int, d)
-        share = ti.Vector.zero(float, d)
+        weights, rises = ti.Matrix.zero(float, 3, d), ti.Matrix.zero(float, 3, d)
         beyond = 0.0
         for a in ti.static(range(d)):
-            last = numbers[first + d + 1 + a] - 1.0
             u = (y[a] - numbers[first + a]) / spacing
-            clamped = ti.min(ti.max(u, 0.0), last)
+            clamped = ti.min(ti.max(u, 0.5), numbers[first + d + 1 + a] - 1.5)
             beyond += (u - clamped) ** 2
-            base[a] = ti.cast(ti.min(ti.floor(clamped), last - 1.0), int)
-            share[a] = clamped - ti.cast(base[a], float)
+            base[a] = ti.cast(ti.min(clamped + 0.5, numbers[first + d + 1 + a] - 1.5), int)
+            t = clamped - ti.cast(base[a], float)
+            weights[0, a], weights[1, a], weights[2, a] = 0.5 * (0.5 - t) ** 2, 0.75 - t**2, 0.5 * (0.5 + t) ** 2
+            rises[0, a], rises[1, a], rises[2, a] = t - 0.5, -2.0 * t, t + 0.5
         phi = 0.0
         slope = ti.Vector.zero(float, d)
-        for corner in range(ti.static(2**d)):
-            index = 0
-            weight = 1.0
+        for corner in range(ti.static(3**d)):
+            index, rest, weight, rise = 0, corner, 1.0, ti.Vector.one(float, d)
             for a in ti.static(range(d)):
-                up = corner >> a & 1
-                index = index * ti.cast(numbers[first + d + 1 + a], int) + base[a] + up
-                weight *= share[a] if up == 1 else 1.0 - share[a]
+                k = rest % 3
+                rest = rest // 3
+                index = index * ti.cast(numbers[first + d + 1 + a], int) + base[a] + k - 1
+                own = ti.select(k == 0, weights[0, a], ti.select(k == 1, weights[1, a], weights[2, a]))
+                up = ti.select(k == 0, rises[0, a], ti.select(k == 1, rises[1, a], rises[2, a]))
+                weight *= own
+                for b in ti.static(range(d)):
+                    rise[b] *= up if ti.static(a == b) else own
             value = self.samples[sample + index]
             phi += weight * value
-            for a in ti.static(range(d)):
-                part = value if corner >> a & 1 == 1 else -value
-                for b in ti.static(range(d)):
-                    if ti.static(b != a):
-                        part *= share[b] if corner >> b & 1 == 1 else 1.0 - share[b]
-                slope[a] += part
-        size = slope.norm()
-        normal = slope * 0.0
-        normal[0] = 1.0
-        if size > 0:
-            normal = slope / size
-        return phi + spacing * ti.sqrt(beyond), normal
+            slope += value * rise
+        return phi + spacing * ti.sqrt(beyond), direction_of(slope, slope.norm(), first_axis(y))

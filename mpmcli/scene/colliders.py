@@ -136,6 +136,8 @@ class ColliderShape(Shape):
     def _plane_has_its_normal(self) -> "ColliderShape":
         if self.plane and self.rotation is not None:
             raise flaw("has a normal; leave rotation out", "plane")
+        if self.plane and (self.add or self.subtract):
+            raise flaw("is a shape alone; leave add and subtract out, or give a box or a polygon", "plane")
         return self
 
 

@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import combinations, product
+from itertools import chain, combinations, islice, product
 from typing import Annotated, Any
 
 import numpy as np
@@ -120,6 +120,31 @@ class Composite(Solid):
         for form in self.removed:
             distance = np.maximum(distance, -form.signed_distance(points))
         return distance
+
+
+# Clauses up to which a form is taken apart.
+MOST_CLAUSES = 64
+Part = tuple[Solid, int]
+
+
+def clauses_of(form: Solid, sign: int = 1) -> list[tuple[Part, ...]]:
+    """Return simple forms with signs: the distance is the maximum over clauses of their least sign * distance.
+
+    With sign = -1 it is that from the complement.
+
+    The list is cut off after MOST_CLAUSES + 1. It has one clause for the added forms and one for each removed form, but
+    products of these where a composite is added to another form.
+    """
+    if not isinstance(form, Composite):
+        return [((form, sign),)]
+
+    def least(groups: list[list[tuple[Part, ...]]]) -> list[tuple[Part, ...]]:
+        return [sum(chosen, ()) for chosen in islice(product(*groups), MOST_CLAUSES + 1)]
+
+    added, removed = [clauses_of(one, sign) for one in form.added], [clauses_of(one, -sign) for one in form.removed]
+    if sign > 0:
+        return [*least(added), *chain(*removed)]
+    return least([[*chain(*added)], *removed])
 
 
 @lru_cache(maxsize=256)

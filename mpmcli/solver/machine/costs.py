@@ -50,7 +50,7 @@ def padded_cells(cells: Sequence[int]) -> tuple[int, ...]:
 
 def padded_colliders(kind: ColliderKind) -> ColliderKind:
     count = max(FEWEST_COLLIDERS, power_of_two(kind.count)) if kind.count else 0
-    sizes = {name: in_steps(getattr(kind, name)) for name in ("numbers", "samples", "points")}
+    sizes = {name: in_steps(getattr(kind, name)) for name in ("parts", "numbers", "samples", "points")}
     return replace(kind, count=count, **sizes)
 
 
