@@ -240,7 +240,7 @@ def test_a_vessel_with_thin_walls_holds_water(
 
 
 def test_a_vessel_given_by_its_outline_holds_water(backend_of: Callable) -> None:
-    """Walls of two cells, on nodes: 4 % of the particles passed the corners before these had the normals of both faces."""
+    """Walls of two cells, on nodes: 4 % of the particles passed the corners before both faces counted there."""
     asked, low, high = vessel(2, 0.0, 2.0, outline=True, velocity=[0.7, 0.0])
     for frame, _ in build_run(asked, backend_of("f32", 1)).frames():
         assert np.maximum(low - frame.position, frame.position - high).max() < 0.3 * H
