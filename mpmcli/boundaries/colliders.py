@@ -30,8 +30,10 @@ from mpmcli.scene.surface import form_surface, surface_points
 # (docs/theory.md, 3.8). A little more than 0.75, so that rounding does not matter for nodes at that distance.
 REACH = 0.76
 # The same if the surface acts at its points (`contact.collider_points`): nodes this deep inside, and deeper, take part
-# in no point, and keep back what got in. Nodes inside a surface that sticks follow the gradient of the velocity beside.
-DEEP, DEEP_STICKING = -0.76, -1.25
+# in no point, and keep back what got in. At 0.6 to 0.76 cells nodes of little mass that are not held make jets, but
+# holding them would slow bodies that move freely. Nodes inside a surface that sticks follow the gradient of the
+# velocity beside.
+DEEP, DEEP_FIXED, DEEP_STICKING = -0.76, -0.6, -1.25
 # A surface acts at nodes all the same where the collider is thin: PROBE cells below it, its distance is above -WITHIN.
 PROBE, WITHIN = 0.75, 0.2
 # Depth in cells from which particles that drift in are moved out.
@@ -234,6 +236,8 @@ class Colliders(Feature):
         self.parts = ti.Vector.field(2, int, shape=n)
         self.wall, self.side, self.faces, self.corners = (ti.field(int, shape=n) for _ in range(4))
         self.friction = ti.field(float, shape=n)
+        # Distance in cells below which it acts at nodes if it acts at points.
+        self.deep = ti.field(float, shape=n)
         # Whether it may be thin somewhere, 1 or 0.
         self.slender = ti.field(int, shape=n)
         # Axes along which a holding collider does not hold, 1 or 0.
@@ -249,7 +253,7 @@ class Colliders(Feature):
         self.turning = ti.Matrix.field(d, d, float, shape=n)
         self.count, self._counts = ti.field(int, shape=runs), [0] * runs
         fields = [self.parts, self.wall, self.side, self.faces, self.corners, self.friction, self.slender, self.lets]
-        fields += [self.place, self.turned, self.reach, self.velocity, self.turning]
+        fields += [self.deep, self.place, self.turned, self.reach, self.velocity, self.turning]
         fields += [self.carried] if at_rest else []
         self._rows, self._count = Rows(*fields), Rows(self.count)
         self._parts = Rows(self.form, self.begin, self.sample, self.sign, self.ends)
@@ -280,7 +284,8 @@ class Colliders(Feature):
             thin = int(slender(collider, h))
             corners = int(has_corners(collider))
             row = [[begin, begin + len(parts)], WALLS[collider.wall], side, faces, corners, collider.friction, thin]
-            row += [held, place - origin, turned, reach_of(collider, h), still[0], still]
+            deep = DEEP_STICKING if collider.wall == "stick" else DEEP if collider.free else DEEP_FIXED
+            row += [held, deep, place - origin, turned, reach_of(collider, h), still[0], still]
             rows.append(row + [np.eye(self.dimension)] * self.at_rest)
         self._rows.write_all(run * self.capacity, rows)
         self._parts.write_all(first, table)
@@ -426,9 +431,7 @@ class Colliders(Feature):
     @ti.func
     def reach_of_surface(self, i: int, pointed: bool):
         """Return the distance outside its surface up to which collider i acts on nodes, m."""
-        reach = REACH
-        if pointed:
-            reach = ti.select(self.wall[i] == STICK, DEEP_STICKING, DEEP)
+        reach = self.deep[i] if pointed else REACH
         return ti.select(self.wall[i] == HOLD, HELD_OUTSIDE, reach) * self.spacing
 
     @ti.func

@@ -65,7 +65,8 @@ class Features:
         if kind.by_points:
             self.colliders.support = grid.scheme.spline.nodes / 2
             fills = any(law.relaxes for law in kind.members)
-            self.points = ColliderPoints(self.colliders, grid.node_count, grid.layers, runs, fills=fills)
+            how = {"fills": fills, "sparse": grid.sparse}
+            self.points = ColliderPoints(self.colliders, grid.node_count, grid.layers, runs, **how)
         self.repulsion = ParticleContact(grid, groups[0], runs) if total and max(kind.bodies) > 1 else None
         self.emission = Emission(kind.inflow, d, runs) if kind.inflow.groups else None
         for g, group in enumerate(groups if self.emission else ()):

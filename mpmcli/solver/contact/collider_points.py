@@ -2,8 +2,8 @@
 
 A node within half a cell of a surface gives one point of it, the nearest. The velocity of the material at the point is
 interpolated from the 3^d nodes around this node, and the impulse that stops it is spread by the same weights. Both
-momenta are exact, and the surface acts where it is, at any position on the grid. Kinetic energy only falls, but for
-material that has drifted in, see `LIFT`.
+momenta are exact, and the surface acts where it is, at any position on the grid. Kinetic energy only falls. A point
+begins a step with its impulse in the last one, so that material at rest keeps no velocity into the surface.
 
 Nodes gather from points, and points from nodes, so that the results depend neither on threads nor on the order in which
 points are found. A step calls, with a barrier after each: `find`, `spread_out`, `weigh`, for rigid bodies `push_rigid`
@@ -15,8 +15,6 @@ import math
 from mpmcli.boundaries.colliders import HELD, HOLD, LOOSE, PRESSED, SEPARATE, STICK, Colliders
 from mpmcli.boundaries.feature import Feature, Phase, changed
 from mpmcli.boundaries.rigid_bodies import ROUNDS
-from mpmcli.materials.law import StateBound
-from mpmcli.materials.registry import laws
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
 from mpmcli.scene.domain import STICKING
@@ -31,15 +29,13 @@ PART, WHOLE = 0.75, 0.9
 # Smallest share of the kernel of a node outside of colliders by which masses are divided, and the smallest for which
 # the mass of a full node is estimated.
 LEAST, FREE = 1e-5, 0.45
-# Material that fills more than the outside of a surface has drifted in by the surplus over RISE cells: per cell, the
-# integral of the square of the spline. Beyond SLACK cells it moves out, at LIFT times the wave speed per cell. Full
-# nodes are those of which OUTER or more is outside.
-RISE, SLACK, LIFT, OUTER = 0.55, 0.2, 0.01, 0.8
 # Distance from a surface, cells, within which a node gives a point: a little more than a half, so that rounding leaves
 # out no surface between two nodes. The share of such a node is at most NEAR.
 HALF, NEAR = 0.501, 0.835
 # Share of the mass of a full node below which the speed of a node does not bound the step.
 LIGHT = 0.1
+# Points of a node that keep their impulses.
+KEPT = 2
 
 
 @ti.func
@@ -57,37 +53,47 @@ class ColliderPoints(Feature):
         capacity: largest number of points of a run.
         count: number of points of each run, while they are found.
         density: mass of a full node, kg, of the lightest material of each run.
-        rate: velocity at which material that has drifted in moves out, per cell, m/s, of each run.
         free: per node, the share of its kernel that is outside of colliders, negative if a collider holds the node.
         head: per node, 1 + the index of its first point, or 0; `next` of a point likewise.
         busy, marked: whether a row of nodes has points, and whether points have weights in it, 1 or 0; for phases that
             go row by row.
         spread: per node, the sum of the weights of all points; -1 while it is not yet summed.
+        pushed: per node, the sum of the impulses with which all points begin, N s.
+        kept: per node, the forces of its first KEPT points in the last step per weight, N. A sparse grid renumbers its
+            nodes: `keeper` is 1 + the index of the node in a dense grid to which they belong.
         collider: index of the collider in its run.
         normal: normal into the material.
         centre: weighted mean of the positions of the nodes relative to the lower corner, m, where impulses act.
         weights: weights of the nodes around the node of the point; `share` is their sum.
         part: share of the point that belongs to the domain: a half on a wall.
         gain: impulse per velocity, kg.
-        lift: velocity at which material moves out of the collider, m/s.
+        first: impulse per weight with which the point begins, N s; `drive` is the velocity that those of all points
+            give to the material, times `share`.
         couples: whether rigid bodies are met.
         fills: whether the inside of colliders counts as filled, because some volumes relax.
         given: velocity of the material times `share`, then the impulse per weight on the material, N s.
     """
 
-    def __init__(self, colliders: Colliders, nodes: int, layers: int, runs: int, *, fills: bool) -> None:
+    def __init__(
+        self, colliders: Colliders, nodes: int, layers: int, runs: int, *, fills: bool, sparse: bool = False
+    ) -> None:
         """Allocate points for a grid with a number of nodes per run and layer."""
         d = colliders.dimension
         self.colliders, self.dimension, self.run, self.layers = colliders, d, 0, layers
         self.node_count, self.capacity, self.stencil = nodes, self.room(nodes, d), 3**d
         n = runs * self.capacity
         self.count = ti.field(int, shape=runs)
-        self.density, self.rate = ti.field(float, shape=runs), ti.field(float, shape=runs)
+        self.density = ti.field(float, shape=runs)
         self.free, self.spread = (ti.field(float, shape=runs * nodes) for _ in range(2))
+        self.pushed = ti.Vector.field(d, float, shape=runs * nodes)
+        self.kept = ti.Vector.field(d, float, shape=runs * nodes * KEPT)
+        self.sparse = sparse
+        self.keeper = ti.field(int, shape=runs * nodes) if sparse else None
         self.head = ti.field(int, shape=runs * nodes)
         self.next, self.collider = ti.field(int, shape=n), ti.field(int, shape=n)
-        self.normal, self.centre, self.given = (ti.Vector.field(d, float, shape=n) for _ in range(3))
-        self.part, self.share, self.gain, self.lift = (ti.field(float, shape=n) for _ in range(4))
+        vectors = (ti.Vector.field(d, float, shape=n) for _ in range(5))
+        self.normal, self.centre, self.given, self.first, self.drive = vectors
+        self.part, self.share, self.gain = (ti.field(float, shape=n) for _ in range(3))
         self.weights = ti.field(float, shape=n * self.stencil)
         self.rows = math.prod(colliders.shape[:-1])
         self.busy, self.marked = ti.field(int, shape=runs * self.rows), ti.field(int, shape=runs * self.rows)
@@ -101,8 +107,9 @@ class ColliderPoints(Feature):
 
     def on(self, nodes: int) -> "ColliderPoints":
         """Return points for a grid with another number of nodes, and the same numbers of runs."""
-        result = ColliderPoints(self.colliders, nodes, self.layers, self.density.shape[0], fills=self.fills)
-        result.density, result.rate = self.density, self.rate
+        runs, sparse = self.density.shape[0], self.sparse
+        result = ColliderPoints(self.colliders, nodes, self.layers, runs, fills=self.fills, sparse=sparse)
+        result.density = self.density
         return result
 
     def viewed(self, view: object) -> "ColliderPoints":
@@ -131,14 +138,16 @@ class ColliderPoints(Feature):
         push = Phase("push_points", "nodes", "points", body=push_points, wanted=last_row, words="let colliders push")
         return (*found, push)
 
+    def saved(self) -> dict[str, ti.Field]:
+        return {} if self.sparse else self.kept_fields
+
+    @property
+    def kept_fields(self) -> dict[str, ti.Field]:
+        """The fields of nodes that persist between steps, by name."""
+        return {"points.kept": self.kept} | ({"points.keeper": self.keeper} if self.sparse else {})
+
     def write(self, scene: Scene, run: int = 0) -> None:
-        """Set the mass of a full node of a run, and the rate."""
-        materials = [source.material for source in scene.sources]
-        members = [laws()[material.law]([material], scene.dimension) for material in materials]
-        modes = [law.modes(material, StateBound()) for law, material in zip(members, materials, strict=True)]
-        stiffness = [max(mode.stiffness for mode in each) for each in modes]
-        waves = [math.sqrt(found / each.density) for found, each in zip(stiffness, materials, strict=True)]
-        self.rate[run] = LIFT * max(waves, default=0.0)
+        """Set the mass of a full node of a run."""
         least = min((body.material.density for body in scene.sources), default=0.0)
         self.density[run] = least * scene.domain.spacing**self.dimension
 
@@ -178,6 +187,7 @@ class ColliderPoints(Feature):
                 index = grid.linear_index(node)
                 entry = ti.static(self.dimension)
                 grid.filling[index][entry] = grid.filling[index][entry] + share
+                grid.filling[index][0] = share
 
     @ti.func
     def owner(self, walls: ti.template(), node: ti.template()):
@@ -215,8 +225,8 @@ class ColliderPoints(Feature):
     # Points.
 
     @ti.func
-    def find(self, grid: ti.template(), walls: ti.template(), extent: ti.template(), node: ti.template()):
-        """Find the points of a node, and their weights."""
+    def find(self, grid: ti.template(), walls: ti.template(), extent: ti.template(), node: ti.template(), kick: float):
+        """Find the points of a node, their weights, and the impulses with which they begin, in a step of `kick` s."""
         d = ti.static(self.dimension)
         index = grid.linear_index(node)
         own = self.place(index)
@@ -232,11 +242,30 @@ class ColliderPoints(Feature):
                 first = ti.atomic_add(self.count[self.run], wanted)
                 if first + wanted <= self.capacity:
                     self.visit(walls, extent, node, own, self.run * self.capacity + first)
-            p, row = self.head[own] - 1, self.row_of(node)
+            p, row, place, keeps = self.head[own] - 1, self.row_of(node), 0, self.keeps(node, own)
             while p >= 0:
                 self.busy[row] = 1
                 self.weight_all(grid, walls, node, p)
+                self.first[p] = ti.Vector.zero(float, d)
+                if place < KEPT and keeps:
+                    self.first[p] = self.gain[p] * kick * self.kept[KEPT * own + place]
+                self.given[p] = self.first[p]
+                place += 1
                 p = self.next[p] - 1
+        for place in range(KEPT):
+            self.kept[KEPT * own + place] = ti.Vector.zero(float, d)
+
+    @ti.func
+    def keeps(self, node: ti.template(), own: int):
+        """Return whether the impulses at a place in the fields of nodes are those of a node, which takes the place."""
+        result = True
+        if ti.static(self.sparse):
+            index = 0
+            for a in ti.static(range(self.dimension)):
+                index = index * ti.static(self.colliders.shape[a]) + node[a]
+            result = self.keeper[own] == index + 1
+            self.keeper[own] = index + 1
+        return result
 
     @ti.func
     def visit(self, walls: ti.template(), extent: ti.template(), node: ti.template(), own: int, first: int):
@@ -313,7 +342,7 @@ class ColliderPoints(Feature):
         for a in ti.static(range(d)):
             place[a] = self.centre[p][a] / h - ti.cast(node[a] - self.colliders.first - 1, float)
         along = self.spline.weights(place)
-        full, over = self.fill_stencil(grid, walls, node, along, p)
+        full = self.fill_stencil(grid, walls, node, p)
         share, total, centre = 0.0, 0.0, ti.Vector.zero(float, d)
         if full > 0.0:
             for c in range(self.stencil):
@@ -333,21 +362,18 @@ class ColliderPoints(Feature):
             self.weights[p * self.stencil + c] = weight
             total += weight
         self.share[p], self.gain[p] = total, acts
-        self.lift[p] = self.rate[self.run] * ti.max(over / RISE - SLACK, 0.0)
         for a in ti.static(range(d)):
             self.centre[p][a] = centre[a] / ti.max(total, LEAST)
 
     @ti.func
-    def fill_stencil(
-        self, grid: ti.template(), walls: ti.template(), node: ti.template(), along: ti.template(), p: int
-    ):
+    def fill_stencil(self, grid: ti.template(), walls: ti.template(), node: ti.template(), p: int):
         """Set the weights of point p to the masses that the nodes would have without colliders.
 
         A node that is held counts as filled, but with a negative sign, because it will have no weight. Return the mass
-        of a full node, kg, and the share of the kernel of the point by which the material fills more than the outside.
+        of a full node, kg.
         """
         d = ti.static(self.dimension)
-        most, held, room, outer, outside = 0.0, 0.0, 0.0, 0.0, 0.0
+        most = 0.0
         for c in range(self.stencil):
             own, _sign = self.owner(walls, self.around(node, c, 1))
             index = grid.linear_index(own)
@@ -358,19 +384,12 @@ class ColliderPoints(Feature):
                     if ti.static(a not in walls.periodic):
                         if own[a] == walls.first or own[a] == walls.last[a]:
                             mass *= 2.0
-                weight, share = self.weight(along, c), ti.abs(free)
-                held += weight * mass
-                room += weight * share
                 if free > FREE:
                     most = ti.max(most, mass / free)
-                if free > OUTER:
-                    outer += mass
-                    outside += free
-                filled = ti.select(free < 0.0, -1.0, 1.0) * mass / ti.max(share, LEAST)
+                filled = ti.select(free < 0.0, -1.0, 1.0) * mass / ti.max(ti.abs(free), LEAST)
             self.weights[p * self.stencil + c] = filled
         # Where the outside holds only spray, `most` is no measure of what fits.
-        lightest = self.density[self.run]
-        return ti.min(most, lightest), held / ti.max(outer / ti.max(outside, LEAST), lightest) - room
+        return ti.min(most, self.density[self.run])
 
     # Sums.
 
@@ -382,16 +401,15 @@ class ColliderPoints(Feature):
 
     @ti.func
     def spread_out(self, grid: ti.template(), walls: ti.template(), node: ti.template()):
-        """Sum the weights of all points at a node and its images."""
+        """Sum the weights of all points at a node and its images, and the impulses with which they begin."""
         own = self.place(grid.linear_index(node))
         if self.spread[own] < 0.0:
-            total = self.gathered(grid, walls, node, False)
-            self.spread[own] = total[0]
+            self.pushed[own], self.spread[own] = self.gathered(grid, walls, node)
 
     @ti.func
-    def gathered(self, grid: ti.template(), walls: ti.template(), node: ti.template(), pushes: ti.template()):
-        """Return the sum over the points of their weights at a node and its images, or if `pushes` of the impulses."""
-        total = ti.Vector.zero(float, self.dimension)
+    def gathered(self, grid: ti.template(), walls: ti.template(), node: ti.template()):
+        """Return the sums over the points of their impulses at a node and its images, and of their weights."""
+        total, weights = ti.Vector.zero(float, self.dimension), 0.0
         if walls.near(node):
             depth, mirror, upper, acts = self.images_of(walls, node)
             for images in range(ti.static(2**self.dimension)):
@@ -402,70 +420,80 @@ class ColliderPoints(Feature):
                         place[a] = mirror[a]
                         self.reflect(walls, a, upper, sign)
                 if exists:
-                    self.gather(grid, place, sign, total, pushes)
+                    weights += self.gather(grid, place, sign, total)
+            # Walls take what is normal to them, and if they stick all.
+            for a in ti.static(range(self.dimension)):
+                if acts[a] == 1 and depth[a] == 0:
+                    holds = walls.face_in(STICKING, a, upper[a])
+                    for c in ti.static(range(self.dimension)):
+                        if ti.static(c == a):
+                            total[c] = 0.0
+                        elif holds:
+                            total[c] = 0.0
         else:
-            self.gather(grid, node, ti.Vector.one(float, self.dimension), total, pushes)
-        return total
+            weights += self.gather(grid, node, ti.Vector.one(float, self.dimension), total)
+        return total, weights
 
     @ti.func
-    def gather(
-        self,
-        grid: ti.template(),
-        node: ti.template(),
-        sign: ti.template(),
-        total: ti.template(),
-        pushes: ti.template(),
-    ):
-        """Add to the total what the points around a node give to it, in order."""
+    def gather(self, grid: ti.template(), node: ti.template(), sign: ti.template(), total: ti.template()):
+        """Add to the total the impulses that the points around a node give to it, in order; return their weights."""
+        weights = 0.0
         for c in range(self.stencil):
             beside = self.around(node, c, -1)
             if grid.in_use(beside) and self.busy[self.row_of(beside)] == 1:
                 p = self.head[self.place(grid.linear_index(beside))] - 1
                 while p >= 0:
                     weight = self.weights[p * self.stencil + c] * self.part[p]
-                    if ti.static(pushes):
-                        for a in ti.static(range(self.dimension)):
-                            total[a] += weight * sign[a] * self.given[p][a]
-                    else:
-                        total[0] += weight
+                    for a in ti.static(range(self.dimension)):
+                        total[a] += weight * sign[a] * self.given[p][a]
+                    weights += weight
                     p = self.next[p] - 1
+        return weights
 
     @ti.func
-    def weigh(self, grid: ti.template(), walls: ti.template(), node: ti.template()):
+    def weigh(self, grid: ti.template(), walls: ti.template(), node: ti.template(), kick: float):
         """Find the gain of the points of a node, and their impulses, unless rigid bodies have yet to be met."""
         d = ti.static(self.dimension)
         p = self.head[self.place(grid.linear_index(node))] - 1
         while p >= 0:
-            resistance, seen = 0.0, ti.Vector.zero(float, d)
+            resistance, drive, seen = 0.0, ti.Vector.zero(float, d), ti.Vector.zero(float, d)
             for c in range(self.stencil):
                 weight = self.weights[p * self.stencil + c]
                 if weight > 0.0:
                     own, sign = self.owner(walls, self.around(node, c, 1))
                     index = grid.linear_index(own)
-                    resistance += weight * self.spread[self.place(index)] / grid.nodes[index][d]
+                    share = weight / grid.nodes[index][d]
+                    resistance += share * self.spread[self.place(index)]
                     for a in ti.static(range(d)):
                         seen[a] += weight * sign[a] * grid.nodes[index][a]
+                        drive[a] += share * sign[a] * self.pushed[self.place(index)][a]
             # The impulse that stops the material if all points act alike.
             self.gain[p] = self.gain[p] / resistance if resistance > 0.0 else 0.0
+            self.drive[p] = drive
             for a in ti.static(range(d)):
                 self.given[p][a] = seen[a]
-            if ti.static(not self.couples):
-                self.settle_point(node, p)
             p = self.next[p] - 1
+        if ti.static(not self.couples):
+            self.settle(grid, node, kick)
 
     @ti.func
-    def settle(self, grid: ti.template(), node: ti.template()):
-        """Find the impulses of the points of a node."""
-        p = self.head[self.place(grid.linear_index(node))] - 1
+    def settle(self, grid: ti.template(), node: ti.template(), kick: float):
+        """Find the impulses of the points of a node in a step of `kick` s, and keep them for the next one."""
+        own = self.place(grid.linear_index(node))
+        p, place = self.head[own] - 1, 0
         while p >= 0:
             self.settle_point(node, p)
+            if place < KEPT and kick > 0.0:
+                if self.colliders.wall[self.run * self.colliders.capacity + self.collider[p]] != STICK:
+                    self.kept[KEPT * own + place] = self.given[p] / kick
+            place += 1
             p = self.next[p] - 1
 
     @ti.func
     def settle_point(self, node: ti.template(), p: int):
         """Find the impulse of a point, and add it to the loads of its collider."""
         i = self.run * self.colliders.capacity + self.collider[p]
-        given, _grip = self.impulse(p)
+        given, _grip, _gain = self.impulse(p)
         for a in ti.static(range(self.dimension)):
             self.given[p][a] = given[a]
         if ti.static(not self.colliders.deterministic):
@@ -499,25 +527,40 @@ class ColliderPoints(Feature):
 
     @ti.func
     def impulse(self, p: int):
-        """Return the impulse per weight on the material at a point, N s, and the effect, see `Colliders.met`."""
+        """Return the impulse per weight on the material at a point, N s, the effect, and the impulse per velocity, kg.
+
+        It begins with that of the last step, and is at most twice the one that would stop the material if all points
+        acted alike: up to there kinetic energy falls. See `Colliders.met` for effects.
+        """
         i = self.run * self.colliders.capacity + self.collider[p]
-        arm, normal = self.centre[p] - self.colliders.place[i], self.normal[p]
+        arm, normal, gain = self.centre[p] - self.colliders.place[i], self.normal[p], self.gain[p]
         own = self.colliders.velocity[i] + self.colliders.turning[i] @ arm
-        relative = self.given[p] - self.share[p] * (own + self.lift[p] * normal)
+        relative = self.given[p] - self.share[p] * own
         away = relative.dot(normal)
         along = relative - away * normal
         result, grip = ti.Vector.zero(float, self.dimension), LOOSE
         if self.colliders.wall[i] == STICK:
-            result, grip = -self.gain[p] * relative, HELD
+            result, grip = -gain * relative, HELD
         elif away < 0.0 or self.colliders.wall[i] != SEPARATE:
-            push, size = -self.gain[p] * away, self.gain[p] * along.norm()
-            result, grip = push * normal, PRESSED
-            bound = self.colliders.friction[i] * ti.max(push, 0.0)
-            if bound > 0.0 and size > 0.0:
-                result -= ti.min(1.0, bound / size) * self.gain[p] * along
-                if bound >= size:
-                    grip = HELD
-        return result, grip
+            start = self.first[p] - gain * (relative + self.drive[p])
+            most, push = -2.0 * gain * away, start.dot(normal)
+            rub, turn = start - push * normal, -gain * along
+            if ti.abs(push) > ti.abs(most) and push * most > 0.0:
+                push, gain = most, 2.0 * gain
+            if push * most > 0.0:
+                result, grip = push * normal, PRESSED
+                bound = self.colliders.friction[i] * ti.max(push, 0.0)
+                if bound > 0.0:
+                    # Within this ball it takes energy, as the push does between 0 and `most`.
+                    off, most_off = (rub - turn).norm(), turn.norm()
+                    if off > most_off:
+                        rub = turn + (most_off / off) * (rub - turn)
+                    size = rub.norm()
+                    if size > 0.0:
+                        result += ti.min(1.0, bound / size) * rub
+                        if bound >= size:
+                            grip = HELD
+        return result, grip, gain
 
     @ti.func
     def push_rigid(self, grid: ti.template(), node: ti.template(), rigid: ti.template()):
@@ -528,7 +571,7 @@ class ColliderPoints(Feature):
             for j in range(rigid.count):
                 b, i = self.run * rigid.count + j, rigid.collider_of(self.run, j)
                 if rigid.settled[b] == 0 and i == self.run * self.colliders.capacity + self.collider[p]:
-                    given, grip = self.impulse(p)
+                    given, grip, gain = self.impulse(p)
                     if grip != LOOSE:
                         arm, normal = self.centre[p] - self.colliders.place[i], self.normal[p]
                         scale = self.share[p] * self.part[p]
@@ -546,7 +589,7 @@ class ColliderPoints(Feature):
                                 for a in ti.static(range(d)):
                                     along[a] = ti.cast(a == c, float)
                             lever = ti.cast(loads.of(along, arm), ti.f64)
-                            rigid.resist(row, lever, scale * self.share[p] * self.gain[p])
+                            rigid.resist(row, lever, scale * self.share[p] * gain)
             p = self.next[p] - 1
 
     @ti.func
@@ -557,7 +600,8 @@ class ColliderPoints(Feature):
         own = self.place(index)
         if self.spread[own] > 0.0:
             self.spread[own] = 0.0
-            change = self.gathered(grid, walls, node, True) / grid.nodes[index][d]
+            change, _weights = self.gathered(grid, walls, node)
+            change /= grid.nodes[index][d]
             if walls.near(node):
                 self.change_images(grid, walls, node, change)
             else:
@@ -575,15 +619,6 @@ class ColliderPoints(Feature):
         """Change the velocity of a node near a wall and of its images."""
         d = ti.static(self.dimension)
         depth, mirror, upper, acts = self.images_of(walls, node)
-        way = change
-        for a in ti.static(range(d)):
-            if acts[a] == 1 and depth[a] == 0:
-                holds = walls.face_in(STICKING, a, upper[a])
-                for c in ti.static(range(d)):
-                    if ti.static(c == a):
-                        way[c] = 0.0
-                    elif holds:
-                        way[c] = 0.0
         for images in range(ti.static(2**d)):
             place, sign, exists = node, ti.Vector.one(float, d), True
             for a in ti.static(range(d)):
@@ -594,7 +629,7 @@ class ColliderPoints(Feature):
             if exists:
                 index = grid.linear_index(place)
                 for a in ti.static(range(d)):
-                    grid.nodes[index][a] = grid.nodes[index][a] + sign[a] * way[a]
+                    grid.nodes[index][a] = grid.nodes[index][a] + sign[a] * change[a]
 
 
 # The bodies of the phases, functions of a node. Points exist in layer 0 alone.
@@ -608,10 +643,10 @@ def fill_solids(at: ti.template(), node: ti.template(), _kick: float):
 
 
 @ti.func
-def find_points(at: ti.template(), node: ti.template(), _kick: float):
+def find_points(at: ti.template(), node: ti.template(), kick: float):
     """Find the points of a node."""
     if at.nodes.colliders.own == 0:
-        at.features.points.find(at.grid, at.nodes.images.walls, at.particles.extent, node)
+        at.features.points.find(at.grid, at.nodes.images.walls, at.particles.extent, node, kick)
 
 
 @ti.func
@@ -622,10 +657,10 @@ def spread_points(at: ti.template(), node: ti.template(), _kick: float):
 
 
 @ti.func
-def weigh_points(at: ti.template(), node: ti.template(), _kick: float):
+def weigh_points(at: ti.template(), node: ti.template(), kick: float):
     """Find the gains of the points of a node, and without rigid bodies their impulses."""
     if at.nodes.colliders.own == 0:
-        at.features.points.weigh(at.grid, at.nodes.images.walls, node)
+        at.features.points.weigh(at.grid, at.nodes.images.walls, node, kick)
 
 
 @ti.func
@@ -653,9 +688,9 @@ def solve_item(phases: ti.template(), at: ti.template()):
 
 
 @ti.func
-def settle_points(at: ti.template(), node: ti.template(), _kick: float):
+def settle_points(at: ti.template(), node: ti.template(), kick: float):
     """Find the impulses of the points of a node after rigid bodies have been met."""
-    at.features.points.settle(at.grid, node)
+    at.features.points.settle(at.grid, node, kick)
 
 
 @ti.func

@@ -120,6 +120,7 @@ def _blocks(batch: Batch) -> dict[str, np.ndarray]:
     if not grid.sparse:
         return {}
     found = {BLOCKS: grid.occupied()}
+    found |= {name: field.to_numpy()[:used] for name, (field, used) in _kept(batch, len(found[BLOCKS])).items()}
     for group, order in zip(device.groups, device.orders, strict=True):
         start = order.start.to_numpy()
         # All tiles after the blocks in use are empty.
@@ -131,7 +132,17 @@ def _block_shapes(batch: Batch, arrays: Mapping[str, np.ndarray]) -> dict[str, t
     """Return the shapes of the arrays of `_blocks` for the number of blocks in `arrays`."""
     count, order = len(arrays[BLOCKS]), batch.device.orders[0]
     starts = {START.format(group.law.name): (count + 3 + order.bins - order.tiles,) for group in batch.device.groups}
-    return {BLOCKS: (count,)} | starts
+    kept = {name: (used, *shape_of(field)[1:]) for name, (field, used) in _kept(batch, count).items()}
+    return {BLOCKS: (count,)} | starts | kept
+
+
+def _kept(batch: Batch, count: int) -> dict[str, tuple[ti.Field, int]]:
+    """Return the fields of the nodes of a sparse grid that persist, and their entries for a number of blocks."""
+    points, grid = batch.device.features.points, batch.device.grid
+    fields = {} if points is None else points.kept_fields
+    return {
+        name: (field, (count + 1) * grid.block * (field.shape[0] // grid.node_count)) for name, field in fields.items()
+    }
 
 
 def _make_room(batch: Batch, arrays: Mapping[str, np.ndarray]) -> None:
@@ -147,6 +158,10 @@ def _make_room(batch: Batch, arrays: Mapping[str, np.ndarray]) -> None:
 def _write_blocks(batch: Batch, arrays: Mapping[str, np.ndarray]) -> None:
     """Restore the arrays of `_blocks`."""
     batch.device.grid.occupy(arrays[BLOCKS])
+    for name, (field, _) in _kept(batch, len(arrays[BLOCKS])).items():
+        whole = np.zeros(shape_of(field), arrays[name].dtype)
+        whole[: len(arrays[name])] = arrays[name]
+        field.from_numpy(whole)
     used = len(arrays[BLOCKS]) + 1
     for group, order in zip(batch.device.groups, batch.device.orders, strict=True):
         saved = arrays[START.format(group.law.name)]

@@ -203,6 +203,7 @@ class FixedPoint:
             grid.nodes[node][first + d] = value[first + d] / self.scales[self.run][OF_MASS]
         if ti.static(grid.keeps_filling):
             if relaxed > 0.0:
+                grid.filling[node] = ti.Vector.zero(float, grid.filling.n)
                 grid.filling[node][d] = self.filling.value(node)[d] / self.scales[self.run][OF_VOLUME]
 
     @ti.func

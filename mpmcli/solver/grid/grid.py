@@ -92,6 +92,7 @@ class Grid(LinearNodes):
         filling: Vector(kept) field: the volume of particles at rest, m^3, in the entry of the mass in `nodes`, in steps
             that relax volumes; None if it follows from the mass.
         keeps_filling: whether `filling` is not None.
+        has_solids: whether the first entry of `filling` is the volume inside of colliders.
         holding: `filling` if it is not None, otherwise `nodes`.
         means: per group, a Vector(4) field: sums over the particles in the cell whose first node is this node, of the
             volume at rest times ln J, and the volume at rest, m^3; and over those that were there in the last step, of
@@ -139,7 +140,7 @@ class Grid(LinearNodes):
         self.layers = layers
         count = runs * layers * self.node_count
         self.nodes = ti.Vector.field(self.width, float, shape=count)
-        self.keeps_filling = keeps_filling
+        self.keeps_filling, self.has_solids = keeps_filling, False
         self.filling = ti.Vector.field(width, float, shape=count) if keeps_filling else None
         self.holding = self.filling if keeps_filling else self.nodes
         self.means = tuple(

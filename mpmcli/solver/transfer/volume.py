@@ -35,6 +35,10 @@ from mpmcli.solver.transfer.lanes import (
 )
 from mpmcli.solver.transfer.splines import PAD, bounded
 
+# Lack of volume that is ignored where a collider cuts the kernel, beside what a law ignores. The density of particles
+# there is less even; without it still water rises from inclined faces.
+UNEVEN = 0.08
+
 
 def averages_volume(settings: SolverSettings, law: Law) -> bool:
     """Return whether the particles of a law share their change of volume."""
@@ -268,6 +272,10 @@ def relax_volume(group: ti.template(), grid: ti.template(), last: ti.template(),
             opens = ti.select(held_beside(x, grid, last) > BESIDE * held, 1.0, 0.0)
     if relaxes:
         seen = 1.0 / filled
+        if ti.static(grid.has_solids and not group.law.opens_at_surfaces):
+            least = ti.min(volume_ratio(group, group.stored(p)), 1.0)
+            if seen < least and solid_around(x, grid):
+                seen = ti.min(least, seen + UNEVEN)
         deformation, inner, change = group.law.relax(
             group.stored(p), group.inner(p), seen, opens, time * grid.inverse_spacing, group.constants(p)
         )
@@ -336,6 +344,20 @@ def held_around(x: ti.template(), grid: ti.template(), last: ti.template()):
                 smallest = ti.min(smallest, held)
         mean, least = total[d], smallest[d]
     return mean, least
+
+
+@ti.func
+def solid_around(x: ti.template(), grid: ti.template()):
+    """Return whether a collider cuts the kernel of a node of the stencil of a point, see `ColliderPoints.fill`."""
+    base, _ = grid.scheme.spline.stencil(x, grid.inverse_spacing)
+    solid = 0.0
+    for q in range(ti.static(grid.scheme.spline.nodes**grid.dimension)):
+        node, rest = base, q
+        for a in ti.static(range(grid.dimension)):
+            node[a] += rest % ti.static(grid.scheme.spline.nodes)
+            rest = rest // ti.static(grid.scheme.spline.nodes)
+        solid += grid.filling[grid.linear_index(node)][0]
+    return solid > 0.0
 
 
 @ti.func
