@@ -9,7 +9,7 @@ import pytest
 import taichi as ti
 from solver_state import bodies_of, scene_of, with_colliders
 
-from mpmcli.boundaries.colliders import NEAR, WIDE, ColliderKind, ColliderMotion, Colliders, has_corners
+from mpmcli.boundaries.colliders import BLEND, BLEND_NEAR, ColliderKind, ColliderMotion, Colliders, has_corners
 from mpmcli.boundaries.loads import Loads
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
@@ -104,7 +104,7 @@ def test_distances_are_those_of_the_shapes(backend_of: Callable, dimension: int)
         # In the corners of a polygon that is not convex they are those of both edges.
         exact = np.abs(found[:, k, 0] - expected) < 1e-12
         assert exact.all() or (has_corners(collider) and exact.mean() > 0.99)
-        assert np.abs(found[:, k, 0] - expected).max() <= WIDE / 8 * H
+        assert np.abs(found[:, k, 0] - expected).max() <= BLEND / 8 * H
         assert np.abs(found[smooth & exact, k, 1:] - around[smooth & exact]).max() < 1e-4
 
 
@@ -158,7 +158,7 @@ def test_composites_have_the_distances_of_their_surface(backend_of: Callable, di
     for k, collider in enumerate(made):
         form, sign = collider.form, -1.0 if collider.side == "inside" else 1.0
         phi, normal = sign * found[:, k, 0], sign * found[:, k, 1:]
-        assert ((phi < 0) == form.contains(points))[np.abs(phi) > WIDE / 8 * H].all()
+        assert ((phi < 0) == form.contains(points))[np.abs(phi) > BLEND / 8 * H].all()
         some = np.flatnonzero(np.abs(phi) < 1.2 * H)
         y = points[some] - phi[some, None] * normal[some]
         ways = []
@@ -169,7 +169,7 @@ def test_composites_have_the_distances_of_their_surface(backend_of: Callable, di
             ways += [beside, -beside]
         # Away from the edges of a part, and from where two parts meet; corners around the material are rounded.
         parts = [part for clause in clauses_of(form) for part, _ in clause]
-        close = np.abs(phi[some]) < NEAR * H
+        close = np.abs(phi[some]) < BLEND_NEAR * H
         apart = np.ones(len(some), dtype=bool)
         for way in ways:
             beside, far = (
@@ -184,6 +184,17 @@ def test_composites_have_the_distances_of_their_surface(backend_of: Callable, di
             assert not form.contains(y + way + tight * normal[some]).any()
         for x, size in zip(points[some[:200]], np.abs(phi[some[:200]]), strict=True):
             assert len(set(form.contains(x + max(size - tight, 0.0) * around))) == 1
+
+
+def test_a_composite_of_many_forms_is_sampled(backend_of: Callable) -> None:
+    """A row of 70 balls: to 0.05 h within a cell of the surface, where two of them do not meet."""
+    backend_of("f64", 1)
+    row = [ball(0.1, [0.1 + 0.01 * k, 0.5]) for k in range(70)]
+    points = np.random.default_rng(4).uniform([0.15, 0.3], [0.75, 0.7], (1000, 2))
+    (made,), found = measured([{"shape": {**row[0], "add": row[1:]}}], 2, points)
+    expected = made.signed_distance(points)
+    near = np.abs(expected) < H
+    assert np.abs(found[near, 0, 0] - expected[near]).max() < 0.05 * H
 
 
 @pytest.mark.parametrize("composite", [False, True])

@@ -70,29 +70,38 @@ class Watched(Features):
 
 
 def obstacles(seed: int) -> Scene:
-    """Return two blobs of water that fly at a floor, a disc, a corner and a bar, all somewhere; no wall is near."""
+    """Return two blobs of water that fly at a floor, a disc, a corner and a bar, all somewhere; no wall is near.
+
+    Gravity changes its side, so that friction does.
+    """
     random = np.random.default_rng(seed)
     x, y, angle = random.uniform(0.3, 0.7), random.uniform(0.3, 0.5), random.uniform(0, 90)
     disc = {"ball": {"center": [x, y], "radius": random.uniform(0.05, 0.12)}}
     bar = {"box": {"min": [0.2, 0.3], "max": [0.5, 0.36]}, "rotation": angle}
+
+    def rough() -> dict:
+        """Return a friction, none in half of the scenes."""
+        return {"friction": float(random.uniform(0, 3)) * (seed % 2)}
+
     edge = [[0.5, 0.3], [0.8, 0.3], [0.8, 0.7], [0.72, 0.7], [0.72, 0.38], [0.5, 0.38]]
     blobs = [
         {"ball": {"center": random.uniform([0.2, 0.75], [0.5, 0.85]).tolist(), "radius": 0.1}},
         {"box": {"min": [0.62, 0.75], "max": [0.74, 0.9]}, "rotation": angle},
     ]
     return scene_of(
-        domain={"size": [1.0, 1.0], "spacing": H, "gravity": [0.0, -G], "walls": "open"},
-        time={"end": 0.15, "frames": 1},
+        domain={"size": [1.0, 1.0], "spacing": H, "gravity": ["30 * sign(sin(50 * t))", -G], "walls": "open"},
+        time={"end": 0.3, "frames": 1},
         solver={"precision": "f64"},
         bodies=[
             {"name": f"b{k}", "material": WATER, "shape": blob, "velocity": random.uniform([-2, -4], [2, 0]).tolist()}
             for k, blob in enumerate(blobs)
         ],
         colliders=[
-            {"name": "disc", "shape": disc | {"subtract": [{"box": {"min": [x, 0.0], "max": [1.0, y]}}]}},
-            {"name": "bar", "shape": bar, "friction": float(random.uniform(0, 1))},
+            {"name": "disc", "shape": disc | {"subtract": [{"box": {"min": [x, 0.0], "max": [1.0, y]}}]}} | rough(),
+            {"name": "bar", "shape": bar} | rough(),
             {"name": "edge", "shape": {"polygon": {"vertices": edge}}, "wall": ["slip", "stick", "separate"][seed % 3]},
-            {"name": "floor", "shape": {"plane": {"point": [0.0, 0.15], "normal": [random.uniform(-0.5, 0.5), 1.0]}}},
+            {"name": "floor", "shape": {"plane": {"point": [0.0, 0.15], "normal": [random.uniform(-0.5, 0.5), 1.0]}}}
+            | rough(),
         ],
     )
 

@@ -22,8 +22,8 @@ from mpmcli.scene.domain import Domain
 from mpmcli.scene.expression import evaluate
 from mpmcli.scene.primitives import Ball, Box, Capsule, Polygon, Solid
 from mpmcli.scene.quantity import AXES
-from mpmcli.scene.shapes import Composite, clauses_of
-from mpmcli.scene.surface import form_surface, surface_points
+from mpmcli.scene.shapes import MOST_PARTS, Composite, clauses_of
+from mpmcli.scene.surface import form_surface, ring, surface_points
 
 # Distance in cells outside a surface up to which it acts on nodes. The outermost of these nodes lies between a quarter
 # of a cell inside and three quarters outside: then fluids neither enter nor lose pressure, and rough surfaces stick
@@ -41,9 +41,9 @@ SUNK = 0.2
 # Distance in cells from a composite up to which its parts are looked at, and that from a face to the points beside it
 # that tell whether the face is a surface of the whole.
 SEAMS, BESIDE = 2.0, 0.05
-# Width in cells over which the faces of a corner blend, at most NEAR cells from them, and the largest cosine between
-# them.
-WIDE, NEAR, CORNER = 0.35, 0.6, 0.8
+# Width in cells over which the faces of a corner blend, the distance up to which they do, and the largest cosine
+# between their normals.
+BLEND, BLEND_NEAR, CORNER = 0.35, 0.6, 0.8
 # Codes of the conditions of surfaces.
 SLIP, STICK, SEPARATE, HOLD = range(4)
 WALLS = {"slip": SLIP, "stick": STICK, "separate": SEPARATE, "hold": HOLD}
@@ -55,8 +55,6 @@ LOOSE, PRESSED, HELD = range(3)
 FORMS = tuple(DISTANCES)
 # Code of all other forms, with distances on a grid.
 GRID = len(FORMS)
-# Simple forms up to which composites are taken apart; others are sampled.
-MOST_PARTS = 64
 BOX = FORMS.index(Box)
 # 2 pi in two parts, because literals have the precision of particles: the first is exact, the second to 1e-10.
 TURN = (6.28125, 2 * math.pi - 6.28125)
@@ -115,7 +113,8 @@ def has_corners(collider: Collider) -> bool:
     """Return whether the surface of a collider may have corners around the material, a box around it aside."""
     if not isinstance(collider.form, Polygon):
         return isinstance(collider.form, Composite)
-    edges = np.diff(form_surface(collider.form).chains()[0], axis=0)
+    vertices = ring(np.array(collider.form.vertices)).points
+    edges = np.roll(vertices, -1, axis=0) - vertices
     ahead = np.roll(edges, -1, axis=0) if collider.side == "inside" else np.roll(edges, 1, axis=0)
     turns = edges[:, 0] * ahead[:, 1] - edges[:, 1] * ahead[:, 0]
     sharp = (edges * ahead).sum(axis=1) < CORNER * np.hypot(*edges.T) * np.hypot(*ahead.T)
@@ -134,7 +133,7 @@ class Part:
 
 
 def parts_of(collider: Collider, domain: Domain) -> list[Part]:
-    """Return the parts of a collider, clause by clause."""
+    """Return the parts of a collider, clause by clause: itself, sampled, if there would be more than MOST_PARTS."""
     clauses = clauses_of(collider.form)
     if sum(map(len, clauses)) > MOST_PARTS:
         clauses = [((collider.form, 1),)]
@@ -497,11 +496,11 @@ class Colliders(Feature):
         phi, normal = 0.0, ti.Vector.zero(float, self.dimension)
         other, slope, least = 0.0, normal, CORNER
         for k in range(ti.static(2 * self.dimension - 1)):
-            if k == 0 or (self.corners[i] == 1 and ti.abs(phi) < NEAR * self.spacing):
+            if k == 0 or (self.corners[i] == 1 and ti.abs(phi) < BLEND_NEAR * self.spacing):
                 way = ti.Vector.zero(float, self.dimension)
                 if k > 0:
                     way = self.tangent(normal, (k - 1) // 2) * ti.cast(2 * (k % 2) - 1, float)
-                place = y + WIDE * self.spacing * way
+                place = y + BLEND * self.spacing * way
                 found, own = self.distance_of_whole(i, place)
                 if ti.static(self.kind.combined):
                     if self.parts[i][1] - self.parts[i][0] > 1 and ti.abs(found) < SEAMS * self.spacing:
@@ -509,8 +508,8 @@ class Colliders(Feature):
                 if k == 0:
                     phi, normal = found, own
                 elif side * own.dot(way) < 0.0 and own.dot(normal) < least:
-                    least, slope, other = own.dot(normal), own, found - WIDE * self.spacing * own.dot(way)
-        apart = side * (other - phi) / (WIDE * self.spacing)
+                    least, slope, other = own.dot(normal), own, found - BLEND * self.spacing * own.dot(way)
+        apart = side * (other - phi) / (BLEND * self.spacing)
         if least < CORNER and ti.abs(apart) < 1.0:
             share = 0.5 + 0.5 * apart
             phi = share * phi + (1.0 - share) * other

@@ -122,24 +122,22 @@ class Composite(Solid):
         return distance
 
 
-# Clauses up to which a form is taken apart.
-MOST_CLAUSES = 64
-Part = tuple[Solid, int]
+# Simple forms up to which a composite is taken apart.
+MOST_PARTS = 64
+Signed = tuple[Solid, int]
 
 
-def clauses_of(form: Solid, sign: int = 1) -> list[tuple[Part, ...]]:
+def clauses_of(form: Solid, sign: int = 1) -> list[tuple[Signed, ...]]:
     """Return simple forms with signs: the distance is the maximum over clauses of their least sign * distance.
 
-    With sign = -1 it is that from the complement.
-
-    The list is cut off after MOST_CLAUSES + 1. It has one clause for the added forms and one for each removed form, but
-    products of these where a composite is added to another form.
+    With sign = -1 it is the distance from the complement. There is a clause for the added forms and one for each
+    removed form, and products of clauses where a composite is added. The list ends after MOST_PARTS + 1 clauses.
     """
     if not isinstance(form, Composite):
         return [((form, sign),)]
 
-    def least(groups: list[list[tuple[Part, ...]]]) -> list[tuple[Part, ...]]:
-        return [sum(chosen, ()) for chosen in islice(product(*groups), MOST_CLAUSES + 1)]
+    def least(groups: list[list[tuple[Signed, ...]]]) -> list[tuple[Signed, ...]]:
+        return [sum(chosen, ()) for chosen in islice(product(*groups), MOST_PARTS + 1)]
 
     added, removed = [clauses_of(one, sign) for one in form.added], [clauses_of(one, -sign) for one in form.removed]
     if sign > 0:
