@@ -10,11 +10,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from check_scenes import SOLID, box
+from made_result import made_row
 from solver_state import scene_of
 
 from mpmcli.check.finding import Finding, FrameFindings
 from mpmcli.check.result_check import ResultCheck, check_kept
-from mpmcli.check.result_state import CrowdCheck, FrameCheck, MomentumCheck, StretchCheck
+from mpmcli.check.result_state import CrowdCheck, FrameCheck, MomentumCheck, RestCheck, StretchCheck
 from mpmcli.check.scene_check import check_scene
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
@@ -109,6 +110,46 @@ def test_a_viscous_liquid_that_sprays_is_told(viscosity: float, mean: float, fir
     J = np.where(np.arange(len(POOL)) % 2, 1.0, 2 * mean - 1)
     scene = pool(material=WATER | {"viscosity": viscosity})
     assert [one.rule for one in crowds(scene, [POOL], volume_ratio=J)[1]] == ["spray"] * fires
+
+
+PHASE = np.linspace(0, 4 * np.pi, 21)
+TURNS = np.minimum(PHASE, 2.0)
+
+
+@pytest.mark.parametrize(
+    ("kinetic", "released", "cells", "law", "more", "fires"),
+    [
+        (TURNS, 0.02 * PHASE, 3.0, "fluid", {}, True),
+        (TURNS, -PHASE, 3.0, "fluid", {}, True),
+        # It hardly moves, swings, moved from the start, is driven by what it releases, or fell; it is honey, or sand.
+        (TURNS, 0.1 * PHASE, 0.8, "fluid", {}, False),
+        (1 - np.cos(PHASE), 0.1 * PHASE, 3.0, "fluid", {}, False),
+        (TURNS[::-1] + 1.0, 0.1 * PHASE, 3.0, "fluid", {}, False),
+        (PHASE, PHASE, 3.0, "fluid", {}, False),
+        (TURNS, 300 * PHASE, 3.0, "fluid", {}, False),
+        (TURNS, 0.1 * PHASE, 3.0, "fluid", {"material": WATER | {"viscosity": 10.0}}, False),
+        (TURNS, 0.1 * PHASE, 3.0, "sand", {}, False),
+    ],
+)
+@pytest.mark.parametrize("up", [-1.0, 1.0])
+def test_water_that_turns_at_rest_is_told(
+    kinetic: np.ndarray, released: np.ndarray, cells: float, law: str, more: dict, fires: bool, up: float
+) -> None:
+    """Whichever way gravity acts; energies are in J, of 1,600 kg of water 0.8 m deep."""
+    scene = pool(**more)
+    domain = scene.domain.model_copy(update={"gravity": (0.0, up * 9.81)})
+    scene = scene.model_copy(update={"domain": domain})
+    # The domain is 1.6 m high.
+    stored = 1600.0 * 9.81 * (0.4 if up < 0 else -1.2)
+    rows = [
+        made_row(k, 2, kinetic=kinetic[k], potential=stored - released[k], elastic=0.0, mass=1600.0)
+        for k in range(len(PHASE))
+    ]
+    places = [POOL + np.array([cells * H * max(k - 10, 0) / 10, 0.0]) for k in range(len(PHASE))]
+    _, found = seen(RestCheck, header_of(scene, law), places, len(places) - 1, rows=rows)
+    assert [(one.rule, one.frame) for one in found] == [("turns", 20)] * fires
+    if fires:
+        assert found[0].value == pytest.approx(cells)
 
 
 def bar(speed: float, count: int = 4, walls: str = "separate", **more: object) -> Scene:

@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 from solver_state import scene_of
 from test_batch import batch_of, outputs_of
+from test_check_frames import header_of
 
 from mpmcli.boundaries.feature import Feature, Phase
+from mpmcli.check.result_check import check_kept
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
@@ -203,6 +205,7 @@ def test_still_water_rests(backend_of: Callable, record_property: Callable) -> N
         height = float(np.ptp(first[:, 1]))
         record_property(f"{name}: kinetic energy over M g h", rows[-1].kinetic / (weight * height))
         assert growth(rows) <= 1e-6 * weight * height, name
+        assert check_kept(header_of(scenes[name], "fluid"), *zip(*frames, strict=True)).findings == (), name
         if name in MOVING:
             continue
         assert rows[-1].kinetic < 1e-5 * weight * height, name

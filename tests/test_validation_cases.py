@@ -24,10 +24,11 @@ COARSE = {name: sorted(case.levels["coarse"]) for name, case in CASES.items()}
 SLOW = {
     "bar_fixed_free", "cantilever", "cantilever_small", "column_corotated", "column_hencky", "column_neo_hookean",
     "conservation", "conservation_3d", "homogeneous", "mms_2d_corotated", "mms_3d", "sand_column_1",
-    "sand_column_2", "sand_column_5", "sloshing", "spinning_disc", "dam_at_rest", "stirred_pool",
+    "sand_column_2", "sand_column_5", "sloshing", "spinning_disc", "dam_at_rest", "stirred_pool", "still_bowl",
+    "still_slope",
     "cook", "fluid_blocks", "metal_blocks", "metal_blocks_3d", "paste_blocks", "sand_blocks_3d", "snow_blocks",
     "dam_break_obstacle", "bingham", "cantilever_total", "column_dynamic", "dam_break", "floating_box", "galilean",
-    "prandtl", "snow_oedometer", "toss", "two_disks", "two_disks_total", "vortex",
+    "prandtl", "snow_oedometer", "toss", "two_disks", "two_disks_total", "u_tube", "vortex",
 }  # fmt: skip
 # The orders of these are taken always, those of the others with -m slow: a wave, one of large strain, a fluid at rest.
 REFINED = {"bar_fixed_fixed", "mms_2d_neo_hookean", "hydrostatic"}

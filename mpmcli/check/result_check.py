@@ -12,7 +12,17 @@ import numpy as np
 from mpmcli.check.collider_work import unsure_work, work_of_colliders
 from mpmcli.check.finding import Finding, FrameFindings, Verdict, passes
 from mpmcli.check.result_entries import RUN_AGAIN, Entry, OpenedResult, check_order, open_entries
-from mpmcli.check.result_state import BLOWN_UP, CRUSHED, CrowdCheck, MomentumCheck, StateCheck, StretchCheck
+from mpmcli.check.result_state import (
+    AT_REST,
+    BLOWN_UP,
+    CRUSHED,
+    CrowdCheck,
+    MomentumCheck,
+    RestCheck,
+    StateCheck,
+    StretchCheck,
+    lowest_potential,
+)
 from mpmcli.errors import InputError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
@@ -45,13 +55,11 @@ TOLD = {
 }
 # Growth of energy without a source, relative to the energy turned over (docs/theory.md, 9.3). The scenes in configs
 # whose bodies share one velocity field stay below 2e-4, bodies thrown at a wall at up to five times their speed of
-# sound below 1e-3.
+# sound below 1e-3. Where hardly anything moves, it is relative to a share of the energy stored, AT_REST.
 ENERGY_SUSPECT, ENERGY_WRONG = 1e-2, 1e-1
 # Growth that is allowed in addition after a minimum at which contact holds energy, which is not in the sum. A block of
 # jelly of 10 cells that rests on a floor has up to 0.045.
 HELD = 6e-2
-# Rounding of energy in single precision, relative to the total energy.
-ENERGY_ROUNDING = 1e-4
 # Masses are summed in double precision and never change.
 MASS_ERROR = 1e-9
 # Relative difference between the volume that liquids and grains fill and that of their particles, in every frame of the
@@ -182,7 +190,7 @@ def _check_frames(opened: OpenedResult, findings: FrameFindings, stop: Callable[
     """Read each frame once, and check its values."""
     header = opened.header
     state, stretch, momentum = (kind(header, findings) for kind in (StateCheck, StretchCheck, MomentumCheck))
-    crowd = CrowdCheck(header, findings, opened.last)
+    crowd, rest = CrowdCheck(header, findings, opened.last), RestCheck(header, findings, opened.last)
     size = 0
     for entry in opened.entries:
         if stop():
@@ -203,6 +211,7 @@ def _check_frames(opened: OpenedResult, findings: FrameFindings, stop: Callable[
                 continue
             momentum.check(frame, entry.row)
             crowd.check(frame)
+            rest.check(frame, entry.row)
             if not header.particle_count_varies:
                 stretch.check(frame)
     return {**stretch.figures, **crowd.figures, **momentum.figures, "bytes": size}
@@ -256,7 +265,7 @@ def check_ledger(entries: Sequence[Entry], header: RunHeader, findings: FrameFin
     work = unsure = np.zeros(len(rows))
     if balanced and header.moved:
         work, unsure = work_of_colliders(rows, header.colliders), unsure_work(rows, header.colliders)
-    energies = of["kinetic"], of["potential"], of["elastic"]
+    energies = of["kinetic"], of["potential"] - of["mass"] * lowest_potential(header), of["elastic"]
     lost, growth = energy_change(*energies, work)[1], energy_change(*energies, work + unsure)[0]
     if "contact_work" in of:
         # Contact takes energy up and returns it. All else is known with the work of contact.
@@ -339,14 +348,15 @@ def energy_change(
 ) -> tuple[np.ndarray, float]:
     """Return the growth above the minimum so far, (T,), and the final loss, both over the energy turned over.
 
-    The energy that `work` has brought so far is not counted.
+    That is at least the share AT_REST of the energy stored; potential energy is that above the lowest place. The energy
+    that `work` has brought so far is not counted.
     """
     total = kinetic + potential + elastic - work
     highest, lowest = np.maximum.accumulate, np.minimum.accumulate
     turned = highest(kinetic) + (highest(potential) - lowest(potential)) + (highest(elastic) - lowest(elastic))
     turned += highest(np.abs(work) + 0.0 * kinetic)
-    turned += ENERGY_ROUNDING * highest(kinetic + np.abs(potential) + np.abs(elastic))
-    turned = np.maximum(turned, np.finfo(np.float64).tiny)
+    stored = highest(kinetic + np.abs(potential) + np.abs(elastic))
+    turned = np.maximum(np.maximum(turned, AT_REST * stored), np.finfo(np.float64).tiny)
     return (total - lowest(total)) / turned, float((total[0] - total[-1]) / turned[-1])
 
 

@@ -35,6 +35,11 @@ FEW, MOST_CELLS = 4, 3e7
 CROWDED, GAPS = 3.0, 0.05
 # Mean J of a viscous liquid that is reported.
 OPENED = 1.2
+# Share of the energy stored that a run at rest counts as having turned over.
+AT_REST = 0.2
+# Water turns at rest if it moves farther than TURNED cells on average in the last half of a run that turns over less
+# than STILL of the energy stored. Its kinetic energy never falls below STEADY of the mean, unlike that of waves.
+TURNED, STILL, STEADY = 1.0, 0.1, 0.3
 # Cells to each side of an inner cell, their smallest mean filling, and the fewest inner cells for a fraction.
 WINDOW, INSIDE, ENOUGH = 2, 0.85, 64
 
@@ -137,6 +142,13 @@ def volume_ratio(header: RunHeader, frame: Frame) -> np.ndarray | None:
     return J
 
 
+def lowest_potential(header: RunHeader) -> float:
+    """Return the potential energy of a unit mass at the lowest place of the domain, relative to its origin, J/kg."""
+    if header.origin is None or header.gravity is None:
+        return 0.0
+    return -float(np.maximum(header.gravity * (header.upper - header.origin), 0.0).sum())
+
+
 def _reach(header: RunHeader, row: LedgerRow, frame: Frame) -> float | None:
     """Return the largest displacement in a row's steps, m, with shifts and rounding; None if unknown."""
     if header.spacing is None or not np.isfinite(row.courant_max):
@@ -164,7 +176,9 @@ class MomentumCheck(FrameCheck):
     def __init__(self, header: RunHeader, findings: FrameFindings) -> None:
         super().__init__(header, findings)
         self._first: LedgerRow | None = None
-        self._time, self._steps, self._kinetic, self._taken = 0.0, 0, 0.0, np.zeros(header.dimension)
+        self._time, self._steps, self._kinetic = 0.0, 0, 0.0
+        # Momentum that colliders took, and its rounding.
+        self._taken, self._rounding = np.zeros(header.dimension), np.zeros(header.dimension)
         self._colliders = len(header.collider_names)
         known = header.origin is not None and header.gravity is not None and header.sticking is not None
         self._free = np.full(header.dimension, known and not header.driven)
@@ -182,7 +196,9 @@ class MomentumCheck(FrameCheck):
         self._first = first = self._first or row
         self._kinetic = max(self._kinetic, row.kinetic)
         self._steps += row.steps
-        self._taken += np.sum(row.collider_force, axis=0) * (row.time - self._time)
+        given = np.array(row.collider_force).reshape(-1, header.dimension) * (row.time - self._time)
+        self._taken += given.sum(axis=0)
+        self._rounding += header.epsilon * np.abs(given).sum(axis=0)
         self._time = row.time
         if frame.index > 0:
             allowed = _reach(header, row, frame)
@@ -197,7 +213,7 @@ class MomentumCheck(FrameCheck):
             return
         middle = row.time - (row.step_min + row.step_max) / 4
         expected = np.array(first.linear_momentum) + row.mass * header.gravity * (middle - first.time)
-        unknown = row.mass * np.abs(header.gravity) * (row.step_max - row.step_min) / 4
+        unknown = row.mass * np.abs(header.gravity) * (row.step_max - row.step_min) / 4 + self._rounding
         difference = (np.abs(np.array(row.linear_momentum) + self._taken - expected) - unknown)[self._free].max()
         angular = 0.0
         spins_on = header.keeps_spin and not (header.gravity.any() or self._colliders or header.periodic.any())
@@ -218,6 +234,48 @@ class MomentumCheck(FrameCheck):
     def lost(self) -> None:
         """Stop the comparison, because a frame could not be read or is not finite."""
         self._free[:] = False
+
+
+class RestCheck(FrameCheck):
+    """Finds water that begins at rest and turns, though nothing drives it (docs/theory.md, 9.3)."""
+
+    def __init__(self, header: RunHeader, findings: FrameFindings, last: int) -> None:
+        super().__init__(header, findings)
+        self._rows: list[LedgerRow] = []
+        self._last, self._middle = last, np.zeros((0, header.dimension))
+        known = header.spacing is not None and header.gravity is not None
+        self._closed = known and not (header.driven or header.particle_count_varies or header.moved)
+        self._water = np.array([body.material.get("viscosity", 0) < VISCOUS for body in header.bodies])
+
+    def check(self, frame: Frame, row: LedgerRow) -> None:
+        """Check a frame of finite values; frames must come in order."""
+        header = self._header
+        liquid = np.array([law.name == "fluid" for law in header.laws], bool)
+        if not (self._closed and liquid.any()):
+            return
+        self._rows.append(row)
+        if frame.index == self._last // 2:
+            self._middle = frame.position
+        if frame.index < self._last or len(self._middle) == 0:
+            return
+        kinetic, rest = np.array([(row.kinetic, row.potential + row.elastic) for row in self._rows]).T
+        late, total = kinetic[len(kinetic) // 2 :], kinetic + rest
+        stored = np.abs(rest - row.mass * lowest_potential(header)).max()
+        steady = kinetic[0] < 0.1 * late.mean() and late.min() > STEADY * late.mean()
+        # A flow that gravity starts has the energy that it released.
+        started = abs(total[-1] - total[0]) < late.mean() / 2
+        rows = liquid[frame.material] & self._water[frame.body]
+        if started or not steady or np.ptp(rest) > STILL * stored or not rows.any():
+            return
+        apart = nearest_image(frame.position[rows] - self._middle[rows], header.period)
+        cells = float(np.linalg.norm(apart, axis=1).mean()) / header.spacing
+        if cells > TURNED:
+            what = (
+                f"Between frames {self._last // 2} and {frame.index} water that began at rest moved {cells:.3g} cells"
+            )
+            what += " on average, though nothing drives it: it turns beside surfaces that are inclined or curved"
+            fix = "Give the colliders a friction of 0.01 or more."
+            self._findings.add("warning", "turns", frame.index, what, fix, value=cells)
 
 
 class StretchCheck(FrameCheck):
