@@ -9,7 +9,7 @@ import pytest
 import taichi as ti
 from solver_state import bodies_of, scene_of, with_colliders
 
-from mpmcli.boundaries.colliders import BLEND, BLEND_NEAR, ColliderKind, ColliderMotion, Colliders, has_corners
+from mpmcli.boundaries.colliders import BLEND, BLEND_NEAR, ColliderKind, ColliderMotion, Colliders, corners_of
 from mpmcli.boundaries.loads import Loads
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
@@ -47,7 +47,10 @@ def run(scene: Scene, backend: object) -> list[tuple[Frame, LedgerRow]]:
 
 @ti.kernel
 def evaluate(colliders: ti.template(), points: ti.types.ndarray(), found: ti.types.ndarray()):
-    """Fill found (n, k, d + 1) with distances and normals of all colliders at the points (n, d)."""
+    """Fill found (n, k, d + 1) with distances and normals of all colliders at the points (n, d).
+
+    There may be d more columns, for the normals that turn around corners.
+    """
     for p in range(points.shape[0]):
         for k in range(found.shape[1]):
             x = ti.Vector.zero(float, ti.static(colliders.dimension))
@@ -57,13 +60,19 @@ def evaluate(colliders: ti.template(), points: ti.types.ndarray(), found: ti.typ
             found[p, k, 0] = phi
             for a in ti.static(range(colliders.dimension)):
                 found[p, k, 1 + a] = normal[a]
+            if found.shape[2] > 1 + colliders.dimension:
+                _, turned = colliders.distance(k, x - colliders.place[k], 0, True)
+                for a in ti.static(range(colliders.dimension)):
+                    found[p, k, 1 + colliders.dimension + a] = turned[a]
 
 
 H = 0.05
 
 
-def measured(colliders: list[dict], dimension: int, points: np.ndarray) -> tuple[tuple[Collider, ...], np.ndarray]:
-    """Return colliders, and as kernels find them their distances and normals at points, (n, k, d + 1); cells of H."""
+def measured(
+    colliders: list[dict], dimension: int, points: np.ndarray, normals: int = 1
+) -> tuple[tuple[Collider, ...], np.ndarray]:
+    """Return colliders, and as kernels find them their distances and normals at points, see `evaluate`; cells of H."""
     corner = {"box": {"min": [0.9] * dimension, "max": [0.95] * dimension}}
     scene = scene_of(
         domain={"size": [1.0] * dimension, "origin": [0.0] * dimension, "spacing": H},
@@ -74,7 +83,7 @@ def measured(colliders: list[dict], dimension: int, points: np.ndarray) -> tuple
     device = Colliders(ColliderKind.of(scene), dimension, (27,) * dimension, 3, 1, on_cpu=True)
     device.spacing = H
     device.write(scene)
-    found = np.zeros((len(points), len(colliders), 1 + dimension))
+    found = np.zeros((len(points), len(colliders), 1 + normals * dimension))
     evaluate(device, points, found)
     return scene.colliders, found
 
@@ -103,9 +112,34 @@ def test_distances_are_those_of_the_shapes(backend_of: Callable, dimension: int)
         assert smooth.sum() > 300
         # In the corners of a polygon that is not convex they are those of both edges.
         exact = np.abs(found[:, k, 0] - expected) < 1e-12
-        assert exact.all() or (has_corners(collider) and exact.mean() > 0.99)
+        assert exact.all() or (corners_of(collider)[0] and exact.mean() > 0.99)
         assert np.abs(found[:, k, 0] - expected).max() <= BLEND / 8 * H
         assert np.abs(found[smooth & exact, k, 1:] - around[smooth & exact]).max() < 1e-4
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_normals_turn_around_a_corner(backend_of: Callable, dimension: int) -> None:
+    """From face to face of a box, 0.2 h inside and outside: continuously, that of a corner is its bisector.
+
+    Also where the box is made of two.
+    """
+    backend_of("f64", 1)
+    whole = box([0.2] * dimension, [0.7] * dimension)
+    halves = box([0.2] * dimension, [0.7] * (dimension - 1) + [0.5])
+    halves |= {"add": [box([0.2] * (dimension - 1) + [0.5], [0.7] * dimension)]}
+    along = np.linspace(-2 * H, 2 * H, 801)
+    for off in (-0.2 * H, 0.0, 0.2 * H):
+        # Along one face, around the corner, and along the other.
+        points = np.full((len(along), dimension), 0.45)
+        points[:, 0] = 0.7 + np.minimum(-along + off, off)
+        points[:, 1] = 0.7 + np.minimum(along + off, off)
+        _, found = measured([{"shape": whole}, {"shape": halves}], dimension, points, 2)
+        found = found[:, :, 1 + dimension :]
+        for normal in (found[:, 0], found[:, 1]):
+            assert np.abs(normal[[0, -1], :2] - [[1, 0], [0, 1]]).max() < 1e-9
+            assert np.abs(normal[400, :2] - 0.5**0.5).max() < 0.01
+            assert np.linalg.norm(np.diff(normal, axis=0), axis=1).max() < 0.02
+            assert (normal[:, :2] > -1e-9).all()
 
 
 def box(low: Sequence[float], high: Sequence[float]) -> dict:

@@ -20,7 +20,7 @@ from mpmcli.scene import Scene
 from mpmcli.scene.colliders import Collider, Plane
 from mpmcli.scene.domain import Domain
 from mpmcli.scene.expression import evaluate
-from mpmcli.scene.primitives import Ball, Box, Capsule, Polygon, Solid
+from mpmcli.scene.primitives import Ball, Box, Capsule, Cylinder, Polygon, Solid, TurnedBox
 from mpmcli.scene.quantity import AXES
 from mpmcli.scene.shapes import MOST_PARTS, Composite, clauses_of
 from mpmcli.scene.surface import form_surface, ring, surface_points
@@ -41,9 +41,11 @@ SUNK = 0.2
 # Distance in cells from a composite up to which its parts are looked at, and that from a face to the points beside it
 # that tell whether the face is a surface of the whole.
 SEAMS, BESIDE = 2.0, 0.05
-# Width in cells over which the faces of a corner blend, the distance up to which they do, and the largest cosine
-# between their normals.
+# Width in cells over which the faces of a corner around the material blend, the distance up to which they do, and the
+# largest cosine between their normals.
 BLEND, BLEND_NEAR, CORNER = 0.35, 0.6, 0.8
+# Width in cells over which the normal turns around a corner of a collider, and the depth from which its faces are seen.
+ROUND, UNDER = 1.0, 0.25
 # Codes of the conditions of surfaces.
 SLIP, STICK, SEPARATE, HOLD = range(4)
 WALLS = {"slip": SLIP, "stick": STICK, "separate": SEPARATE, "hold": HOLD}
@@ -91,7 +93,7 @@ class ColliderKind:
             tuple(k for k, collider in enumerate(found) if collider.free),
             sum(len(contact_points(collider, h)) for collider in found if collider.free),
             any(collider.wall != "hold" for collider in found),
-            any(has_corners(collider) for collider in found),
+            any(any(corners_of(collider)) for collider in found),
             len(parts) > len(found),
         )
 
@@ -109,16 +111,19 @@ class ColliderKind:
         )
 
 
-def has_corners(collider: Collider) -> bool:
-    """Return whether the surface of a collider may have corners around the material, a box around it aside."""
-    if not isinstance(collider.form, Polygon):
-        return isinstance(collider.form, Composite)
-    vertices = ring(np.array(collider.form.vertices)).points
+def corners_of(collider: Collider) -> tuple[bool, bool]:
+    """Return whether a collider may have corners around the material, a box around it aside, and corners of its own."""
+    form, outside = collider.form, collider.side == "outside"
+    if not isinstance(form, Polygon):
+        whole = isinstance(form, Composite)
+        return whole, whole or (outside and isinstance(form, Box | TurnedBox | Cylinder))
+    vertices = ring(np.array(form.vertices)).points
     edges = np.roll(vertices, -1, axis=0) - vertices
-    ahead = np.roll(edges, -1, axis=0) if collider.side == "inside" else np.roll(edges, 1, axis=0)
+    ahead = np.roll(edges, -1, axis=0)
     turns = edges[:, 0] * ahead[:, 1] - edges[:, 1] * ahead[:, 0]
     sharp = (edges * ahead).sum(axis=1) < CORNER * np.hypot(*edges.T) * np.hypot(*ahead.T)
-    return bool(np.any(sharp & (turns > 0)))
+    left, right = bool(np.any(sharp & (turns > 0))), bool(np.any(sharp & (turns < 0)))
+    return (right, left) if outside else (left, right)
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,9 +236,9 @@ class Colliders(Feature):
         columns = (ti.field(int, shape=runs * kind.parts) for _ in range(5))
         self.form, self.begin, self.sample, self.sign, self.ends = columns
         # Of each: index of its first part and of the first one of the next, condition of the surface, -1 for a
-        # container, else 1, number of faces that act in turn, and whether the faces of corners blend, 1 or 0.
-        self.parts = ti.Vector.field(2, int, shape=n)
-        self.wall, self.side, self.faces, self.corners = (ti.field(int, shape=n) for _ in range(4))
+        # container, else 1, number of faces that act in turn, and what `corners_of` returns, 1 or 0.
+        self.parts, self.corners = (ti.Vector.field(2, int, shape=n) for _ in range(2))
+        self.wall, self.side, self.faces = (ti.field(int, shape=n) for _ in range(3))
         self.friction = ti.field(float, shape=n)
         # Distance in cells below which it acts at nodes if it acts at points.
         self.deep = ti.field(float, shape=n)
@@ -281,7 +286,7 @@ class Colliders(Feature):
             # At the edges of a box around the material several faces touch it at once; elsewhere the nearest suffices.
             faces = self.dimension if side < 0 and isinstance(collider.form, Box) else 1
             thin = int(slender(collider, h))
-            corners = int(has_corners(collider))
+            corners = [int(one) for one in corners_of(collider)]
             row = [[begin, begin + len(parts)], WALLS[collider.wall], side, faces, corners, collider.friction, thin]
             deep = DEEP_STICKING if collider.wall == "stick" else DEEP if collider.free else DEEP_FIXED
             row += [held, deep, place - origin, turned, reach_of(collider, h), still[0], still]
@@ -371,7 +376,7 @@ class Colliders(Feature):
                 near = near and (self.own == 0 or self.wall[i] != SEPARATE)
             if near:
                 for face in range(self.faces_of(i)):
-                    phi, normal = self.distance(i, arm, face)
+                    phi, normal = self.distance(i, arm, face, True)
                     pointed = False
                     if ti.static(self.support > 0):
                         pointed = self.own == 0 and self.acts_by_points(i, arm, face, phi, normal)
@@ -474,12 +479,15 @@ class Colliders(Feature):
         return count
 
     @ti.func
-    def distance(self, i: int, arm: ti.template(), face: int):
-        """Return the distance of a position from a face of collider i, m, and the normal into the material."""
+    def distance(self, i: int, arm: ti.template(), face: int, turning: ti.template() = False):
+        """Return the distance of a position from a face of collider i, m, and the normal into the material.
+
+        With `turning` the normal turns around the corners of the collider, and is no gradient there.
+        """
         y, side = self.turned[i].transpose() @ arm, ti.cast(self.side[i], float)
         phi, own = 1e30, ti.Vector.zero(float, self.dimension)
         if ti.static(self.kind.cornered):
-            phi, own = self.distance_with_corners(i, y, side)
+            phi, own = self.distance_with_corners(i, y, side, turning)
         else:
             phi, own = self.distance_of_part(self.parts[i][0], y)
         if ti.static(self.boxes):
@@ -488,33 +496,46 @@ class Colliders(Feature):
         return side * phi, side * (self.turned[i] @ own)
 
     @ti.func
-    def distance_with_corners(self, i: int, y: ti.template(), side: float):
-        """Return the signed distance of y from collider i, m, and the normal, blended in corners around the material.
+    def distance_with_corners(self, i: int, y: ti.template(), side: float, turning: ti.template()):
+        """Return the signed distance of y from collider i, m, and the normal, blended where two faces meet.
 
-        Their other face is the nearest one at a place beside y.
+        In corners around the material the other face is the nearest one at a place beside y. With `turning` the normal
+        turns around those of the collider, too: their faces are the nearest ones at the place below y, and beside it.
         """
-        phi, normal = 0.0, ti.Vector.zero(float, self.dimension)
-        other, slope, least = 0.0, normal, CORNER
-        for k in range(ti.static(2 * self.dimension - 1)):
-            if k == 0 or (self.corners[i] == 1 and ti.abs(phi) < BLEND_NEAR * self.spacing):
-                way = ti.Vector.zero(float, self.dimension)
-                if k > 0:
-                    way = self.tangent(normal, (k - 1) // 2) * ti.cast(2 * (k % 2) - 1, float)
-                place = y + BLEND * self.spacing * way
-                found, own = self.distance_of_whole(i, place)
-                if ti.static(self.kind.combined):
-                    if self.parts[i][1] - self.parts[i][0] > 1 and ti.abs(found) < SEAMS * self.spacing:
-                        found, own = self.without_seams(i, place, found, own)
-                if k == 0:
-                    phi, normal = found, own
-                elif side * own.dot(way) < 0.0 and own.dot(normal) < least:
-                    least, slope, other = own.dot(normal), own, found - BLEND * self.spacing * own.dot(way)
-        apart = side * (other - phi) / (BLEND * self.spacing)
-        if least < CORNER and ti.abs(apart) < 1.0:
-            share = 0.5 + 0.5 * apart
-            phi = share * phi + (1.0 - share) * other
-            blend = share * normal + (1.0 - share) * slope
-            normal = direction_of(blend, blend.norm(), normal)
+        phi, normal, h = 0.0, ti.Vector.zero(float, self.dimension), self.spacing
+        near, least = True, CORNER
+        for own_corner in range(ti.static(2 if turning else 1)):
+            bend, width, at = -side, BLEND * h, y
+            if own_corner == 1:
+                near = self.corners[i][1] == 1 and ti.abs(phi) < BLEND_NEAR * h and least == CORNER
+                bend, width, at = side, ROUND * h, y - side * ti.max(side * phi + UNDER * h, 0.0) * normal
+            face, depth, slope, other = normal, phi, normal, phi
+            # A loop, so that the distance is compiled once.
+            for k in range(ti.static(2 * self.dimension - 1)):
+                if near:
+                    way = ti.Vector.zero(float, self.dimension)
+                    if k > 0:
+                        way = self.tangent(face, (k - 1) // 2) * ti.cast(2 * (k % 2) - 1, float)
+                    place = at + width * way
+                    found, own = self.distance_of_whole(i, place)
+                    if ti.static(self.kind.combined):
+                        if self.parts[i][1] - self.parts[i][0] > 1 and ti.abs(found) < SEAMS * h:
+                            found, own = self.without_seams(i, place, found, own)
+                    seen = found + own.dot(y - place)
+                    if k == 0:
+                        face, depth = own, seen
+                        if own_corner == 0:
+                            phi, normal = found, own
+                            near = self.corners[i][0] == 1 and ti.abs(phi) < BLEND_NEAR * h
+                    elif bend * own.dot(way) > 0.0 and own.dot(face) < least:
+                        least, slope, other = own.dot(face), own, seen
+            apart = bend * (depth - other) / width
+            if near and least < CORNER and ti.abs(apart) < 1.0:
+                share = 0.5 + 0.5 * apart
+                blend = share * face + (1.0 - share) * slope
+                normal = direction_of(blend, blend.norm(), normal)
+                if own_corner == 0:
+                    phi = share * depth + (1.0 - share) * other
         return phi, normal
 
     @ti.func

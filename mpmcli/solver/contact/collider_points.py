@@ -276,7 +276,7 @@ class ColliderPoints(Feature):
             if self.colliders.wall[i] != HOLD and self.colliders.covers(i, x):
                 arm = x - self.colliders.place[i]
                 for face in range(self.colliders.faces_of(i)):
-                    phi, normal = self.colliders.distance(i, arm, face)
+                    phi, normal = self.colliders.distance(i, arm, face, True)
                     if ti.abs(phi) <= HALF * h and self.colliders.acts_by_points(i, arm, face, phi, normal):
                         y, part = self.place_inside(walls, extent, node, x - phi * normal, normal)
                         if part > 0.0:
