@@ -30,9 +30,9 @@ RUBBER = SOLID | {"poissons_ratio": 0.3}
 WATER = {"law": "fluid", "density": 1000.0, "bulk_modulus": 1e5}
 
 
-def header_of(scene: Scene, law: str = "neo_hookean") -> RunHeader:
+def header_of(scene: Scene, law: str = "neo_hookean", precision: str = "f64") -> RunHeader:
     """Return the header of a run of a scene whose bodies follow one law."""
-    backend = {"arch": "cpu", "threads": 1, "precision": "f64"}
+    backend = {"arch": "cpu", "threads": 1, "precision": precision}
     return RunHeader.of(scene, scene_to_toml(scene), [laws()[law]], backend)
 
 
@@ -287,3 +287,20 @@ def test_spin_that_is_lost_is_a_fault_of_apic_alone(transfer: str, drift: float)
     figures, found = seen(MomentumCheck, header_of(scene), [x, x], rows=[first, then])
     assert figures == {"momentum_frames": 1, "momentum_drift": pytest.approx(drift, abs=1e-12)}
     assert [one.rule for one in found] == ["momentum"] * (drift > 0)
+
+
+@pytest.mark.parametrize(
+    ("precision", "off", "fires"), [("f32", 3e-6, False), ("f32", 1e-4, True), ("f64", 3e-6, True)]
+)
+def test_what_a_collider_carries_is_known_to_its_rounding(precision: str, off: float, fires: bool) -> None:
+    """Water of 1,200 N at rest on a collider, for 0.1 s: 120 N s, of which f32 knows 7e-6."""
+    first = made_row(0, 2, mass=1200 / 9.81, kinetic=1e-9, linear_momentum=(0.0, 0.0), collider_force=((0.0, 0.0),))
+    more = {"step_min": 1e-12, "step_max": 1e-12, "linear_momentum": (0.0, off)}
+    then = replace(first, time=0.1, steps=1, collider_force=((0.0, -1200.0),), **more)
+    collider = {"name": "floor", "shape": box([0.5, 0.2], [1.9, 0.6])}
+    domain = {"size": [2.4, 1.6], "spacing": H, "gravity": [0.0, -9.81]}
+    water = {"name": "water", "material": WATER, "shape": box([0.5, 0.6], [1.9, 1.0])}
+    scene = scene_of(domain=domain, time={"end": 1.0, "frames": 1}, bodies=[water], colliders=[collider])
+    x = np.array([[0.9, 0.8], [1.1, 0.8]])
+    _, found = seen(MomentumCheck, header_of(scene, "fluid", precision), [x, x], rows=[first, then])
+    assert [one.rule for one in found] == ["momentum"] * fires

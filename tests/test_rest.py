@@ -150,21 +150,24 @@ def vessels() -> dict[str, tuple[dict, list[dict]]]:
     bowl = (0.4 + 0.35 * np.stack([np.cos(angles), np.sin(angles)], axis=1)).tolist()
     tank = turned([[0.15, 0.15], [0.65, 0.15], [0.65, 0.65], [0.15, 0.65]], 25.0, 0.4)
     big, small = ({"ball": {"center": [0.4, 0.4], "radius": radius}} for radius in (0.3, 0.15))
-    moat = big | {"subtract": [small]}
+    moat, round_bowl = big | {"subtract": [small]}, {"ball": {"center": [0.41, 0.39], "radius": 0.34}}
     # Its legs meet half a ring at a face.
     half = big | {"subtract": [small, box([0.0, 0.4], [0.8, 0.8])]}
     legs = [box([x, 0.4], [x + 0.15, 0.8]) for x in (0.1, 0.55)]
     columns = [box([x, 0.4], [x + 0.15, 0.55]) for x in (0.1, 0.55)]
     disc = {"ball": {"center": [0.41, 0.22], "radius": 0.12}}
+    floor = box([-0.1, -0.1], [0.9, 0.1033])
     crate, tilted = box([0.28, 0.14], [0.52, 0.3]), box([0.287, 0.146], [0.527, 0.306]) | {"rotation": 20}
     return {
         "slope": ({"polygon": {"vertices": wedge}}, [slope]),
         "bevels": ({"polygon": {"vertices": basin}}, [{"polygon": {"vertices": one}} for one in bevels]),
         "bowl": ({"polygon": {"vertices": below(bowl, 0.4)}}, [{"polygon": {"vertices": bowl}}]),
         "tank": ({"polygon": {"vertices": below(tank, 0.4)}}, [{"polygon": {"vertices": tank}}]),
+        "round": (round_bowl | {"subtract": [box([0.0, 0.43], [0.8, 0.8])]}, [round_bowl]),
         "moat": ({**big, "subtract": [small, box([0.0, 0.5], [0.8, 0.8])]}, [moat]),
         "tube": ({**columns[0], "add": [columns[1], half]}, [{**legs[0], "add": [legs[1], half]}]),
         "disc": ({**box([0.0, 0.0], [0.8, 0.5]), "subtract": [disc]}, [disc]),
+        "floor": (box([0.0, 0.1033], [0.8, 0.4033]), [floor]),
         "crate": ({**box([0.0, 0.0], [0.8, 0.5]), "subtract": [crate]}, [crate]),
         "tilted": ({**box([0.0, 0.0], [0.8, 0.5]), "subtract": [tilted]}, [tilted]),
         "dam": (box([0.5, 0.42], [0.8, 0.7]), [slope]),
@@ -173,18 +176,18 @@ def vessels() -> dict[str, tuple[dict, list[dict]]]:
 
 
 AT_REST = {"initial_pressure": "hydrostatic"}
-INSIDE, MOVING = ("bowl", "tank", "moat", "tube", "swing"), ("dam", "swing")
+INSIDE, MOVING = ("bowl", "round", "tank", "moat", "tube", "swing"), ("dam", "swing")
 
 
 def still(name: str) -> Scene:
     """Return water at rest in or on a vessel."""
     water, colliders = vessels()[name]
-    side = "inside" if name in INSIDE else "outside"
+    how = {"side": "inside" if name in INSIDE else "outside", "friction": 0.01 if name == "round" else 0.0}
     return scene_of(
         domain={"size": [0.8, 0.8], "spacing": H, "gravity": [0.0, -G]},
         time={"end": 2.0, "frames": 40},
         bodies=[{"name": "water", "material": "water", "shape": water} | ({} if name in MOVING else AT_REST)],
-        colliders=[{"name": f"c{k}", "shape": shape, "side": side} for k, shape in enumerate(colliders)],
+        colliders=[{"name": f"c{k}", "shape": shape} | how for k, shape in enumerate(colliders)],
     )
 
 
@@ -195,10 +198,11 @@ def growth(rows: Sequence[LedgerRow]) -> float:
 
 
 def test_still_water_rests(backend_of: Callable, record_property: Callable) -> None:
-    """On a slope, between bevels, in a bowl, a turned tank, a moat and a U tube, and around a disc and two boxes.
+    """On a slope, a floor, between bevels, in bowls, a turned tank, a moat and a U tube, around a disc and two boxes.
 
-    Kinetic energy is below 1e-5 of M g h after 2 s, energy never rises, and what carries the water has its weight. So
-    does what moves: a dam that runs up a slope, and a U tube with unequal levels, lose energy all the time.
+    Kinetic energy is below 1e-5 of M g h after 2 s, energy never rises, `check` finds nothing, and what carries the
+    water has its weight. So does what moves: a dam that runs up a slope, and a U tube with unequal levels, lose energy
+    all the time. In a round bowl water rests with a friction of 0.01.
     """
     scenes = {name: still(name) for name in vessels()}
     found = outputs_of(batch_of(list(scenes.values()), backend_of("f32", 1)), list(scenes.values()))
@@ -209,16 +213,16 @@ def test_still_water_rests(backend_of: Callable, record_property: Callable) -> N
         record_property(f"{name}: kinetic energy over M g h", rows[-1].kinetic / (weight * height))
         # Beside a box volumes close by little (5.11 of docs/theory.md).
         assert growth(rows) <= (1e-4 if name == "crate" else 1e-6) * weight * height, name
-        assert check_kept(header_of(scenes[name], "fluid"), *zip(*frames, strict=True)).findings == (), name
+        header = header_of(scenes[name], "fluid", "f32")
+        assert check_kept(header, *zip(*frames, strict=True)).findings == (), name
         if name in MOVING:
             continue
         assert rows[-1].kinetic < 1e-5 * weight * height, name
         drift = np.linalg.norm(last - first, axis=1) / H
         assert drift.max() < 2 and drift.mean() < 0.5, name
         force = -np.mean([np.sum(row.collider_force, axis=0)[1] for row in rows[20:]])
-        assert force / weight == pytest.approx(
-            carried(name), rel=0.02 if name in ("bevels", "disc", "crate", "tilted") else 1e-3
-        ), name
+        within = {"bevels": 0.015, "disc": 0.015, "crate": 0.02, "tilted": 0.02}.get(name, 1e-3)
+        assert force / weight == pytest.approx(carried(name), rel=within), name
 
 
 def carried(name: str) -> float:

@@ -245,37 +245,36 @@ class RestCheck(FrameCheck):
         self._last, self._middle = last, np.zeros((0, header.dimension))
         known = header.spacing is not None and header.gravity is not None
         self._closed = known and not (header.driven or header.particle_count_varies or header.moved)
-        self._water = np.array([body.material.get("viscosity", 0) < VISCOUS for body in header.bodies])
+        self._liquid = np.array([law.name == "fluid" for law in header.laws], bool)
+        self._thin = np.array([body.material.get("viscosity", 0) < VISCOUS for body in header.bodies], bool)
 
     def check(self, frame: Frame, row: LedgerRow) -> None:
         """Check a frame of finite values; frames must come in order."""
-        header = self._header
-        liquid = np.array([law.name == "fluid" for law in header.laws], bool)
-        if not (self._closed and liquid.any()):
+        if not (self._closed and self._liquid.any()):
             return
         self._rows.append(row)
         if frame.index == self._last // 2:
             self._middle = frame.position
-        if frame.index < self._last or len(self._middle) == 0:
+        water = self._liquid[frame.material] & self._thin[frame.body]
+        if frame.index < self._last or len(self._middle) == 0 or not water.any() or not self._turns():
             return
-        kinetic, rest = np.array([(row.kinetic, row.potential + row.elastic) for row in self._rows]).T
-        late, total = kinetic[len(kinetic) // 2 :], kinetic + rest
-        stored = np.abs(rest - row.mass * lowest_potential(header)).max()
-        steady = kinetic[0] < 0.1 * late.mean() and late.min() > STEADY * late.mean()
-        # A flow that gravity starts has the energy that it released.
-        started = abs(total[-1] - total[0]) < late.mean() / 2
-        rows = liquid[frame.material] & self._water[frame.body]
-        if started or not steady or np.ptp(rest) > STILL * stored or not rows.any():
-            return
-        apart = nearest_image(frame.position[rows] - self._middle[rows], header.period)
+        header = self._header
+        apart = nearest_image(frame.position[water] - self._middle[water], header.period)
         cells = float(np.linalg.norm(apart, axis=1).mean()) / header.spacing
         if cells > TURNED:
-            what = (
-                f"Between frames {self._last // 2} and {frame.index} water that began at rest moved {cells:.3g} cells"
-            )
-            what += " on average, though nothing drives it: it turns beside surfaces that are inclined or curved"
+            what = f"Water that began at rest moved {cells:.3g} cells on average between frames {self._last // 2} and "
+            what += f"{frame.index}, though nothing drives it: it turns beside inclined or curved surfaces"
             fix = "Give the colliders a friction of 0.01 or more."
             self._findings.add("warning", "turns", frame.index, what, fix, value=cells)
+
+    def _turns(self) -> bool:
+        """Return whether motion has arisen from rest, goes on, and has not the energy that gravity released."""
+        kinetic, rest = np.array([(row.kinetic, row.potential + row.elastic) for row in self._rows]).T
+        late, total = kinetic[len(kinetic) // 2 :], kinetic + rest
+        stored = np.abs(rest - self._rows[0].mass * lowest_potential(self._header)).max()
+        steady = kinetic[0] < 0.1 * late.mean() and late.min() > STEADY * late.mean()
+        released = abs(total[-1] - total[0]) < late.mean() / 2
+        return bool(steady and not released and np.ptp(rest) < STILL * stored)
 
 
 class StretchCheck(FrameCheck):

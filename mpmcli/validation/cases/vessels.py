@@ -27,9 +27,9 @@ def energy_rise(energy: np.ndarray) -> float:
 
 
 class StillWater(Case):
-    """Water that starts at rest under its hydrostatic pressure; `height` is that of its level above its lowest point.
+    """Water that starts at rest under its hydrostatic pressure on a collider, which carries its weight.
 
-    `carried` is the force on the collider over the weight of the water, upwards, by the pressure of water at rest.
+    `height` is that of its level above its lowest point.
     """
 
     text = case_text("still_water")
@@ -45,7 +45,6 @@ class StillWater(Case):
     water: ClassVar[Tables]
     vessel: ClassVar[Tables]
     height: ClassVar[float]
-    carried: ClassVar[float]
 
     def tables(self, n: int) -> Tables:
         return tank(n, (3.0, 60), self.water, self.vessel, initial_pressure="hydrostatic")
@@ -61,7 +60,7 @@ class StillWater(Case):
         return {
             "kinetic energy": row.kinetic / scale,
             "drift": float(np.linalg.norm(frame.position - first, axis=1).max()) * n / SIZE,
-            "force error": float(np.mean(forces[len(forces) // 2 :])) / weight / self.carried - 1,
+            "force error": float(np.mean(forces[len(forces) // 2 :])) / weight - 1,
             "energy rise": energy_rise(np.array(energies)) / scale,
         }
 
@@ -76,7 +75,7 @@ class StillSlope(StillWater):
     name, title = "still_slope", "Still water on a slope"
     water: ClassVar[Tables] = {"polygon": {"vertices": [[0.0, RISE[0]], [SIZE, RISE[1]], [SIZE, LEVEL], [0.0, LEVEL]]}}
     vessel: ClassVar[Tables] = {"shape": {"plane": {"point": [0.0, RISE[0]], "normal": [RISE[0] - RISE[1], SIZE]}}}
-    height, carried = LEVEL - RISE[0], 1.0
+    height = LEVEL - RISE[0]
 
 
 # Corners of the bowl.
@@ -91,7 +90,7 @@ class StillBowl(StillWater):
     bowl: ClassVar[Tables] = {"polygon": {"vertices": CORNERS.tolist()}}
     water: ClassVar[Tables] = bowl | {"subtract": [box([0.0, 0.56], [SIZE, SIZE])]}
     vessel: ClassVar[Tables] = {"shape": bowl, "side": "inside"}
-    height, carried = 0.5, 1.0
+    height = 0.5
 
 
 # The tube: half a ring of radii INNER and OUTER about (0.5, 0.5) below two legs, in which water stands LEG above the
