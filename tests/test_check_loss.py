@@ -98,7 +98,7 @@ def test_a_viscous_flow_is_as_slow_as_foretold(backend_of: Callable, cells: int,
     (finding,) = told(scene, "numerical-viscosity")
     step = scene.time.end / expected_steps(SceneFacts(channel(cells, 0.8)))
     k = math.pi
-    assert finding.value == pytest.approx(0.024 * (k / cells) ** 4 / (step * k**2) / NU, rel=2e-3)
+    assert finding.value == pytest.approx(0.024 * (k / cells) ** 4 / (step * k**2) / NU, rel=5e-3)
     assert finding.severity == "note"
     *_, (frame, _) = build_run(scene, backend_of("f64", 1)).frames()
     middle = np.abs(frame.position[:, 0] - np.median(frame.position[:, 0])) < 0.5

@@ -14,6 +14,7 @@ from mpmcli.check.finding import SEVERITIES
 from mpmcli.check.scene_check import check_scene
 from mpmcli.check.step_rules import HALF_ULP, LOST_MOTION, STRESS_NOISE
 from mpmcli.errors import InputError
+from mpmcli.materials.fluid import Fluid
 from mpmcli.materials.registry import laws
 from mpmcli.scene import LoadedScene
 from mpmcli.scene.problem import listed, quoted
@@ -21,7 +22,7 @@ from mpmcli.scene.problem import listed, quoted
 H = 1 / 64
 SAND = {"law": "sand", "density": 1600.0, "youngs_modulus": 1e7}
 GRAINS = SAND | {"friction_angle": 30.0}
-REST_LIMIT = H / math.sqrt(2 * 1e3)
+REST_LIMIT = Fluid.eases[0] * H / math.sqrt(2 * 1e3)
 WALL_3D = {"size": [1.0, 1.0, 1.0], "cells": [32, 32, 32], "gravity": [0.0, 0.0, -10.0]}
 
 

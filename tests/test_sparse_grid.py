@@ -108,7 +108,7 @@ def test_the_kernel_numbers_the_same_tiles(backend_of: Callable) -> None:
     nodes = grid.nodes.to_numpy()
     volumes = [body.volume * body.count for body in sample_bodies(start)]
     assert nodes[:, 2].sum() == pytest.approx(1000.0 * sum(volumes), rel=1e-5)
-    run.advance(INTERVAL)
+    run.advance(2 * INTERVAL)
     assert not np.array_equal(grid.occupied(), before)
     # Particles were shifted too, and nothing was written to the nodes that stand for all others.
     for nodes, size in ((grid.nodes, grid.block), (grid.fine.fill, grid.fine.block)):

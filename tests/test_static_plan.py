@@ -21,7 +21,7 @@ MODULES = {
     "forces": {"solver.drive.expressions.TimeTables", "solver.drive.forces.GroupForce"},
     "moving walls": {"boundaries.walls.MovingFaces"},
     "periodic faces": {"solver.grid.period.Period"},
-    "shifts": {"solver.transfer.redistribution"},
+    "shifts": {"solver.transfer.redistribution.FineGrid", "solver.transfer.redistribution.shift_lanes"},
     "bodies that separate": {f"solver.contact.{name}" for name in ("body_contact", "shared_field", "surfaces")},
     # Not asked for by the scene with features either.
     "grids of distances": {"boundaries.distances.GridDistance"},
@@ -104,7 +104,7 @@ def test_a_plain_scene_has_nothing_of_features(backend_of: Callable, given: Coun
     plain, backend = scene(with_features=False), backend_of("f32", 1)
     plan = make_plan(plain, backend)
     assert plan.passes == ("clear grid", "scatter fluid", "find contact", "update grid", "gather fluid")
-    assert plan.laws[0].fields.keys() == {"position", "velocity", "velocity_gradient", "volume_ratio", "id"}
+    assert plan.laws[0].fields.keys() == {"position", "velocity", "velocity_gradient", "volume_ratio", "borne", "id"}
     run = step(plain, backend)
     # What is counted is not blind to what there is.
     for word, place in (("field", "solver.grid."), ("function", "boundaries.walls.")):

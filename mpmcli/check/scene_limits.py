@@ -123,7 +123,7 @@ def _material_limits(body: Body, law: Law, state: str, bound: StateBound, scene:
     smallest: dict[str, tuple[float, float, float]] = {}
     modes = law.reference_modes if solver.solids == "total" else law.modes
     for mode in modes(body.material, law.rebound_bound(bound)):
-        value, name = mode_limit(spacing, density, mode.stiffness, mode.viscosity, inertia)
+        value, name = mode_limit(spacing, density, mode.stiffness / law.relief, mode.viscosity, inertia)
         entry = (value, mode.stiffness, mode.viscosity)
         smallest[name] = min(smallest.get(name, entry), entry)
     for name, (value, stiffness, viscosity) in smallest.items():
@@ -145,6 +145,8 @@ def _material_limits(body: Body, law: Law, state: str, bound: StateBound, scene:
         if inertia != 1:
             scheme = f'transfer = "{solver.transfer}" with kernel = "{solver.kernel}"'
             why += f"; {scheme} is stable at {longer:.3g} times that step"
+        if name == "wave" and law.relief != 1:
+            why += f"; its lone particles bear less stress, which allows {math.sqrt(law.relief):.3g} times that step"
         meaning = _state_text(bound, "at rest" if state == "rest" else "as at rest")
         fix = f"{_capital(cure)} {allow} about twice the step."
         yield SceneLimit(value, name, body.name, state, meaning, f"{why}.", fix, bound)

@@ -10,6 +10,7 @@ from mpmcli.check.finding import Finding
 from mpmcli.check.forecast import damped_step, expected_steps, steps_at, wave_loss
 from mpmcli.check.geometry import spanned_axes, touched_walls
 from mpmcli.check.material_rules import LOCKING
+from mpmcli.check.scene_limits import law_of
 from mpmcli.check.shape_rules import pulled_stretch
 from mpmcli.plain_text import plain_number
 from mpmcli.scene.bounds import body_points, highest_speed
@@ -60,7 +61,9 @@ def step_findings(facts: SceneFacts) -> Iterator[Finding]:
         courant = ""
         if start.name == "wave":
             # c dt / h, c = sqrt(S / (d density)).
-            most = math.sqrt(step_inertia(facts.scene.solver) / facts.scene.dimension)
+            scene = facts.scene
+            relief = next((law_of(one, scene.dimension).relief for one in scene.sources if one.name == start.body), 1.0)
+            most = math.sqrt(step_inertia(scene.solver) * relief / scene.dimension)
             courant = f" (Courant number c dt / h = {most * step / start.value:.3f}, the limit is {most:.3f})"
         whose = f' of body "{start.body}"' if start.body else ""
         limit = f"{start.value:.4g} s, the {start.name} limit{whose} at the start{courant}"

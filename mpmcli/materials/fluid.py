@@ -205,6 +205,7 @@ class Fluid(Law):
     coherent = True
     flows = True
     shifts = True
+    eases = (1.6, 1.8)
 
     def __init__(self, members: tuple[FluidParameters, ...], dimension: int) -> None:
         super().__init__(members, dimension)
@@ -300,6 +301,15 @@ class Fluid(Law):
         if ti.static(self.viscous):
             tau += constants[VISCOSITY] * (C + C.transpose())
         return tau, spherical, J, internal
+
+    @ti.func
+    def eased(self, tau: ti.template(), tau_zz: float, share: float):
+        """Reduce the pressure, which `respond` returns as tau_zz in 3D, too; viscosity has its own bound."""
+        return tau - (1.0 - share) * tau_zz * ti.Matrix.identity(float, tau.n), share * tau_zz
+
+    @ti.func
+    def released(self, deformation: ti.template(), share: float):
+        return ti.max(deformation, 1.0) + share * ti.min(deformation - 1.0, 0.0)
 
     @ti.func
     def grown(self, J_minus_1: float, growth: float, constants: ti.template()):

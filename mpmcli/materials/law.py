@@ -87,6 +87,8 @@ class Law(ABC):
             (docs/theory.md, 4.4).
         flows: whether it is a liquid or grains, whose volume the ledger compares with the volume filled on the grid.
         shifts: whether particles are shifted out of crowds (docs/theory.md, 5.12).
+        eases: in 2D and 3D, the bound on its step over that of a lone particle, if its stress is reduced where few
+            particles share nodes (docs/theory.md, 6.1); empty for other laws.
         opens_at_surfaces: whether `relax` applies near free surfaces, too, compared with the density below a plane one.
         lost: fraction of the motion not resolved by nodes that it loses in a step of its own (docs/theory.md, 2.3).
         elastic: whether the stress is a function of F alone, so that the body can be computed on the grid of its state
@@ -109,6 +111,7 @@ class Law(ABC):
     coherent: ClassVar[bool] = False
     flows: ClassVar[bool] = False
     shifts: ClassVar[bool] = False
+    eases: ClassVar[tuple[float, ...]] = ()
     opens_at_surfaces: ClassVar[bool] = False
     lost: ClassVar[float] = 1.0
     elastic: ClassVar[bool] = False
@@ -154,6 +157,11 @@ class Law(ABC):
 
         The step is stable if dt^2 stiffness + 2 dt viscosity <= density h^2 for each mode (docs/theory.md, 6.1).
         """
+
+    @property
+    def relief(self) -> float:
+        """The stiffness of a lone particle over that which it has left."""
+        return self.eases[self.dimension - 2] ** 2 if self.eases else 1.0
 
     def reference_modes(self, parameters: MaterialParameters, bound: StateBound) -> list[Mode]:
         """Return the modes of an isolated particle on the grid of the state at rest: of dP/dF (docs/theory.md, 6.9).
@@ -236,6 +244,16 @@ class Law(ABC):
             constants: as for `respond` if `grows_by_constants`, else a single unused 0.
         """
         return J_minus_1 + (growth + growth * J_minus_1)
+
+    @ti.func
+    def eased(self, tau: ti.template(), tau_zz: float, share: float):
+        """Return tau and tau_zz of a particle that bears a share of its stress."""
+        return share * tau, share * tau_zz
+
+    @ti.func
+    def released(self, deformation: ti.template(), share: float):
+        """Return the state with a share of the strain that causes stress. Only laws with `eases` have this method."""
+        raise NotImplementedError
 
     @ti.func
     def relax(

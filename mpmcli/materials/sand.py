@@ -156,6 +156,7 @@ class Sand(HenckyLaw):
     projects = True
     flows = True
     shifts = True
+    eases = (1.4, 1.6)
     opens_at_surfaces = True
     lost = 0.15
 
@@ -206,6 +207,11 @@ class Sand(HenckyLaw):
         if ti.static(self.dimension == 2):
             tau_zz = spherical + constants[MU] * kept
         return tau, tau_zz, F, v
+
+    @ti.func
+    def released(self, deformation: ti.template(), share: float):
+        Q, s = principal_stretches(deformation)
+        return stretch_tensor(Q, share * hencky_strains(s))
 
     @ti.func
     def relax(

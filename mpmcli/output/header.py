@@ -349,7 +349,7 @@ class RunHeader:
 
     def shifted(self, steps: int, last: int) -> float:
         """Return the largest shift of a particle in the `steps` steps up to `last`, m, for one particle per cell."""
-        shifts = last // INTERVAL - (last - steps) // INTERVAL
+        shifts = (last - 1) // INTERVAL - (last - steps - 1) // INTERVAL
         return shifts * 2 * FARTHEST * self.spacing if self.shifts and self.spacing is not None else 0.0
 
     @property

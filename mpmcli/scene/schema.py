@@ -189,7 +189,7 @@ class SolverSettings(Table):
     redistribute: Literal["auto", False] = Field(
         "auto",
         description="Whether particles of liquids and grains are shifted out of crowds that the flow creates. "
-        '"auto": those of fluid and sand, every 50 steps, by two fifths of their distance at most.',
+        '"auto": those of fluid and sand, every 30 steps, by two fifths of their distance at most.',
     )
     deterministic: Flag = Field(
         False,

@@ -1,8 +1,8 @@
 """Closed-form bounds on the time step of MLS-MPM with leapfrog, one function per bound (docs/theory.md, 6).
 
 The wave bound is exact for an isolated particle, which is the least stable configuration: particles that share nodes
-allow steps up to 1.7 times larger with APIC and quadratic B-splines. `transfer_factors.step_inertia` extends the bound
-to the other transfer schemes.
+allow steps up to 1.7 times larger with APIC and quadratic B-splines. `Law.relief` extends it for laws whose isolated
+particles bear less stress, `transfer_factors.step_inertia` to the other transfer schemes.
 """
 
 import math
@@ -15,7 +15,7 @@ COURANT = 0.5
 DEFORMATION = 0.5
 
 WHY = {
-    "wave": "a pressure or shear wave must not cross more than one cell in a step, even for a lone particle",
+    "wave": "a pressure or shear wave must not cross much more than one cell in a step",
     "viscosity": "momentum must not diffuse across more than a quarter of a cell's square in a step",
     "speed": "a particle must not move more than half a cell in a step",
     "deformation": "a particle must not be compressed by more than half in a step",

@@ -13,7 +13,10 @@ INVERSE_MOMENT = {"quadratic": 4, "cubic": 3}
 APIC_LOSS = {"quadratic": 0.024, "cubic": 0.047}
 
 # Steps from one relaxation of volumes, and one shift of particles, to the next (docs/theory.md, 5.11 and 5.12).
-INTERVAL = 50
+INTERVAL = 30
+# Openings at which the share of its stress that a particle of a law with `Law.eases` bears begins to fall, and at which
+# it has its smallest value (docs/theory.md, 6.1).
+EASED_FROM, EASED_TO = 0.15, 0.5
 # Largest displacement of a particle in a shift, and back, in distances of fine nodes.
 FARTHEST = 0.2
 

@@ -322,7 +322,10 @@ class GpuLaunch:
         self.device, self.layout, self.doubles = device, layout, doubles
         self.dimension, self.runs, groups = device.grid.dimension, device.runs, device.groups
         self.capacity, self.members = tuple(device.capacity), tuple(enumerate(groups))
-        self.phases, self.shifts = GpuPhases(device, layout, doubles=doubles), device.grid.fine is not None
+        self.phases, self.shifts = (
+            GpuPhases(device, layout, doubles=doubles),
+            any(phase.shifts for phase in device.phases),
+        )
         self.parts = self._parts()
         self.steps = StepSize.of(device, layout, device.values if doubles else HostValues(device.values))
         self.sorts, self.moved = device.sorts, sorted_fields(groups)

@@ -13,6 +13,7 @@ from taichi.lang.impl import inside_kernel, subscript
 
 from mpmcli.quick_taichi import ti
 from mpmcli.solver.particles.state_bounds import ENTRIES
+from mpmcli.stability.transfer_factors import INTERVAL
 
 Columns = int | range | tuple[range, ...]
 # Status of a run: idle (free, or waiting for the host); to be measured; advancing; measured, because a bound on its
@@ -86,7 +87,7 @@ RUN: Mapping[str, Entry] = {
     "courant": _real("kernel"),  # displacement of the fastest node in the last step, cells
     "drift": _real("kernel", math.inf),  # bound on the displacement of particles since the last sort, cells
     "unrelaxed": _real("kernel"),  # time since the last relaxation of volumes, s
-    "unrelaxed_steps": _int("kernel"),
+    "unrelaxed_steps": _int("kernel", INTERVAL - 1),  # the first step relaxes
     "rate": _real("kernel", per="group"),  # largest rate of deformation in the last step, 1/s
     "particles": _int("kernel", None, "group"),  # active particles
     "blocked": _int("kernel"),  # blocked particles of emitters

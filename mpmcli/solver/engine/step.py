@@ -22,6 +22,7 @@ from mpmcli.quick_taichi import ti
 from mpmcli.solver.grid.grid import Grid
 from mpmcli.solver.particles.arrays import ParticleArrays
 from mpmcli.solver.transfer import redistribution as by
+from mpmcli.solver.transfer.easing import ease_phases
 from mpmcli.solver.transfer.node_update import NodeUpdate
 
 
@@ -42,6 +43,7 @@ def step_phases(
     update = "update grid with colliders" if nodes.collides else "update grid"
     own = (
         *(shift_phases(arrays, grid) if grid.fine else ()),
+        *(ease_phases(arrays, grid) if any(group.eased for group in arrays) else ()),
         Phase("clear", "nodes", "scatter", words="clear grid"),
         *(
             Phase("average", "particles", "scatter", g, adds=True, words="average volumes of {}")

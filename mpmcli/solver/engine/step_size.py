@@ -440,9 +440,8 @@ class StepControl:
         for place, parameters in zip(group.bodies, group.law.members, strict=True):
             modes = group.law.reference_modes if group.total else group.law.modes
             for mode in modes(parameters, bound):
-                value, cause = mode_limit(
-                    self._spacing, parameters.density, mode.stiffness, mode.viscosity, self._inertia
-                )
+                stiffness = mode.stiffness / group.law.relief
+                value, cause = mode_limit(self._spacing, parameters.density, stiffness, mode.viscosity, self._inertia)
                 limits.append(Limit(value, cause, self._names[place]))
         return limits
 

@@ -104,8 +104,12 @@ def write_range(
                     stored *= stretch_to(missing[lane], d)
                 state = deformed_on(group.law, stored, C, 0.5 * (k - 1) * dt)
                 tau, tau_zz, after, inner_after = group.law.respond(state, inner, C, dt, constants)
+                borne = 1.0
+                if ti.static(group.eased):
+                    borne = group.borne[begin + ti.min(lane, own - 1)]
+                    tau, tau_zz = group.law.eased(tau, tau_zz, borne)
                 if k == 0:
-                    found[0, lane] = group.law.energy(after, inner_after, constants)
+                    found[0, lane] = borne * group.law.energy(after, inner_after, constants)
                 if ti.static(not group.law.projects):
                     after = stored
                     inner_after = inner

@@ -6,6 +6,7 @@ from copy import copy
 import numpy as np
 
 from mpmcli.boundaries.rows import Rows
+from mpmcli.frames.frame import WAITING
 from mpmcli.materials.elementary import exp
 from mpmcli.materials.law import Law
 from mpmcli.quick_taichi import ti
@@ -64,6 +65,8 @@ class ParticleArrays:
         growth: growth of ln J in the last step, (n); None unless the group is `evened`.
         evened: whether particles take the mean growth of their cell in G2P, because they change cells: `uses_f_bar` and
             not `total`.
+        eased: whether the law of the group `eases`.
+        borne: the share of its stress that a particle bears, (n); None unless the group is `eased`, see `easing`.
         slip: slip of a particle on the wall that pushes it, (n) Vector(d), m; stored with friction
             (`has_wall_friction`), see `total_solids`.
         carried: (n) Vector(d + 1), the normal to the nearest face of the body, and the depth below it, m, at rest or,
@@ -105,6 +108,7 @@ class ParticleArrays:
         self.levels, self.averages = levels, uses_f_bar or levels
         self.keeps_initial, self.evened = keeps_initial or total, uses_f_bar and not total
         self.has_wall_friction, self.particle_count_varies = has_wall_friction, particle_count_varies
+        self.eased = bool(law.eases)
         self.layers, self.surfaced = layers.count, layers.separate and law.surfaced
         wanted = self._wanted()
         sizes = {float: np.dtype(self.real).itemsize, int: 4}
@@ -115,6 +119,7 @@ class ParticleArrays:
         self.internal = tuple(made[variable.name] for variable in law.internal)
         self.initial, self.slip, self.carried = (made.get(name) for name in ("initial_position", "slip", "surface"))
         self.cell, self.to_mean, self.growth = (made.get(name) for name in ("cell", "volume_to_mean", "volume_growth"))
+        self.borne = made.get("borne")
         self.id, self.body, self.activity = made["id"], made.get("body"), made.get("activity")
         self.has_body_force, self.force, self.run = False, None, 0
         self.mouths: object = None
@@ -142,6 +147,7 @@ class ParticleArrays:
         fields |= {"initial_position": (float, d, 1)} if self.keeps_initial else {}
         fields |= {"volume_to_mean": (float, 1, 1), "cell": (int, 1, 1)} if self.averages else {}
         fields |= {"volume_growth": (float, 1, 1)} if self.evened else {}
+        fields |= {"borne": (float, 1, 1)} if self.eased else {}
         fields |= {"slip": (float, d, 1)} if self.has_wall_friction else {}
         fields |= {"surface": (float, d + 1, 1)} if self.surfaced else {}
         fields |= {"id": (int, 1, 1)} | ({"body": (int, 1, 1)} if self.many_bodies else {})
@@ -174,7 +180,7 @@ class ParticleArrays:
         """All real fields that the sort moves."""
         initial = () if self.initial is None else (self.initial,)
         deformation = self.J_minus_1 if self.displacement_gradient is None else self.displacement_gradient
-        more = tuple(field for field in (self.slip, self.growth, self.carried) if field is not None)
+        more = tuple(field for field in (self.slip, self.growth, self.carried, self.borne) if field is not None)
         return (self.x, self.v, self.gradient, deformation, *self.internal, *initial, *more)
 
     @property
@@ -195,7 +201,7 @@ class ParticleArrays:
             + ["slip"] * self.has_wall_friction
             + ["volume_growth"] * self.evened
         )
-        initial += ["surface"] * self.surfaced
+        initial += ["surface"] * self.surfaced + ["borne"] * self.eased
         labels = ["id"] + ["body"] * (self.body is not None) + ["activity"] * self.particle_count_varies
         return dict(zip([*names, *initial, *labels], (*self.state, *self.labels), strict=True))
 
@@ -308,6 +314,12 @@ class ParticleArrays:
                     self.slip[p][c] = 0.0
             if ti.static(self.evened):
                 self.growth[p] = 0.0
+            if ti.static(self.eased):
+                # A particle that waits enters beside few others.
+                share = 1.0
+                if labels[q, 2] == WAITING:
+                    share = 1.0 / self.law.relief
+                self.borne[p] = share
             if ti.static(self.surfaced):
                 for c in ti.static(range(d + 1)):
                     self.carried[p][c] = reals[q, reals.shape[1] - ti.static(d + 1) + c]

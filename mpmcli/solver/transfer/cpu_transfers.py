@@ -60,6 +60,7 @@ def scatter_range(
     pushes = zero_lanes(ti.static(d + d * d if group.is_pushed else 1))
     touches = zero_lanes(ti.static(d if particles.repels else 1))
     frictions = zero_lanes(ti.static(d if group.has_wall_friction else 1))
+    shares_borne = zero_lanes(1)
     loaded = ti.static(
         group.uses_f_bar
         or particles.repels
@@ -81,6 +82,8 @@ def scatter_range(
         origin = bounded(begin)
         load_vectors(places, group.place_on_grid, origin)
         load_vectors(speeds, group.v, origin)
+        if ti.static(group.eased):
+            load_entry(shares_borne, 0, group.borne, (), origin)
         if ti.static(group.total):
             load_vectors(heres, group.x, origin)
         if count < LANES:
@@ -109,7 +112,8 @@ def scatter_range(
             push, slope = vector_of(pushes, 0, d, lane), matrix_of(pushes, d, d, lane)
             touch, friction = vector_of(touches, 0, d, lane), vector_of(frictions, 0, d, lane)
             (loads,) = ti.static((Loads(share, lacking, push, slope, touch, friction),))
-            (own,) = ti.static((Sender(place, here, v, C, state, inner, row, constants, loads),))
+            borne = shares_borne[0, lane]
+            (own,) = ti.static((Sender(place, here, v, C, state, inner, row, constants, loads, borne),))
             base, distance = grid.scheme.spline.stencil(place, grid.inverse_spacing)
             middle, change, plastic, inner_after = p2g(particles, group, own, distance, kick)
             ratios[lane] = volume_ratio(group, state)

@@ -44,7 +44,8 @@ def own_limit(source: Body | Emitter, law: Law, scene: Scene) -> float:
     material, h, inertia = source.material, scene.domain.spacing, step_inertia(scene.solver)
     modes = law.reference_modes if scene.solver.solids == "total" else law.modes
     found = modes(material, StateBound())
-    stiffness = (mode_limit(h, material.density, mode.stiffness, mode.viscosity, inertia)[0] for mode in found)
+    ends = ((mode.stiffness / law.relief, mode.viscosity) for mode in found)
+    stiffness = (mode_limit(h, material.density, *pair, inertia)[0] for pair in ends)
     return min(*stiffness, speed_limit(h, highest_speed(source, scene.time.end), 0.0))
 
 

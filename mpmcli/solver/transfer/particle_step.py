@@ -27,6 +27,7 @@ class Sender:
         inner: internal variables.
         row, constants: its row of the table of its group, and the constants of the law in that row.
         loads: the loads returned by `loads_on`.
+        borne: the share of its stress that it bears.
     """
 
     place: Any
@@ -38,6 +39,7 @@ class Sender:
     row: Any
     constants: Any
     loads: "Loads"
+    borne: Any
 
 
 @dataclass(frozen=True)
@@ -142,11 +144,13 @@ def p2g(particles: ti.template(), group: ti.template(), own: ti.template(), dist
     if ti.static(group.uses_f_bar):
         stretch = stretch_to(own.loads.missing, d)
         seen *= stretch
-    stress, _, plastic, inner = group.law.respond(seen, own.inner, own.C, kick, own.constants)
+    stress, spherical, plastic, inner = group.law.respond(seen, own.inner, own.C, kick, own.constants)
     if ti.static(group.law.projects):
         plastic -= seen
         if ti.static(group.uses_f_bar):
             plastic /= stretch
+    if ti.static(group.eased):
+        stress, _ = group.law.eased(stress, spherical, own.borne)
     v, C = own.v, own.C
     if ti.static(group.is_pushed):
         v += kick * own.loads.push

@@ -119,7 +119,10 @@ class ParticleUpdate:
             place, here = group.on_grid(p), group.x[p]
             share, missing, push, slope, touch, friction = loads_on(self, g, group, p, kick, True)
             (loads,) = ti.static((Loads(share, missing, push, slope, touch, friction),))
-            (own,) = ti.static((Sender(place, here, v, C, state, inner, row, constants, loads),))
+            borne = 1.0
+            if ti.static(group.eased):
+                borne = group.borne[p]
+            (own,) = ti.static((Sender(place, here, v, C, state, inner, row, constants, loads, borne),))
             base, distance = grid.scheme.spline.stencil(place, grid.inverse_spacing)
             middle, change, plastic, inner_after = p2g(self, group, own, distance, kick)
             if ti.static(group.law.projects):

@@ -42,6 +42,8 @@ from mpmcli.stability.transfer_factors import FARTHEST
 PUSH = 8.0
 # Excess of the filling over 1 below which it counts less: that of rows of a lattice stretched twice.
 MILD = 0.5
+# Bound on a displacement in the sums in fixed point, cells.
+LARGEST_WAY = 4.0
 
 
 def fine_nodes(scene: Scene, laws: Sequence[Law]) -> int:
@@ -201,7 +203,8 @@ def shift(at: ti.template(), p: int, time: float):
     slope = slope_of(fine, fine.stencil_at(fine_base), fine.scheme.spline.weights(fine_distance), fine_distance)
     way = held_back(at, x, way_down(at, slope, C, time))
     base, distance = grid.scheme.spline.stencil(x, grid.inverse_spacing)
-    add_shift(at, grid.stencil_at(base), grid.scheme.spline.weights(distance), group.row(p)[MASS], way)
+    even = ti.Matrix.zero(float, d, d)
+    add_shift(at, grid.stencil_at(base), grid.scheme.spline.weights(distance), group.row(p)[MASS], way, even)
     for a in ti.static(range(d)):
         group.x[p][a] = x[a] + way[a]
         group.v[p][a] = v[a] + (C @ way)[a]
@@ -309,7 +312,8 @@ def shift_lanes(at: ti.template(), first: int, last: int, time: float, back: ti.
             for lane in range(count):
                 stay_rolled(at.order.buffers.real, first_node[lane])
                 w = weights_of(weights, nodes, d, lane)
-                add_shift(at, first_node[lane], w, masses[lane], vector_of(ways, 0, d, lane))
+                even = ti.Matrix.zero(float, d, d)
+                add_shift(at, first_node[lane], w, masses[lane], vector_of(ways, 0, d, lane), even)
         begin += LANES
 
 
@@ -349,21 +353,29 @@ def way_down(at: ti.template(), slope: ti.template(), C: ti.template(), time: fl
 
 
 @ti.func
-def add_shift(at: ti.template(), first: ti.template(), w: ti.template(), mass: float, way: ti.template()):
-    """Add the mass of a particle times its displacement, and its mass, to the nodes of a stencil."""
+def add_shift(
+    at: ti.template(), first: ti.template(), w: ti.template(), mass: float, way: ti.template(), slope: ti.template()
+):
+    """Add the mass of a particle times its displacement, m, and its mass, to the nodes of a stencil.
+
+    The rows of `slope` are the change of the displacement per cell along each axis, m.
+    """
     grid, d = ti.static((at.grid, at.grid.dimension))
-    value, even = ti.Vector.zero(float, grid.width), ti.Matrix.zero(float, d, grid.width)
-    for a in ti.static(range(d)):
-        value[a] = mass * way[a]
-    value[d] = mass
+    value, change = ti.Vector.zero(float, grid.width), ti.Matrix.zero(float, d, grid.width)
+    scale = mass
     if ti.static(grid.deterministic):
         # Convert to a speed within the range of the sums.
+        scale *= grid.fixed.pace[grid.fixed.run][2] * ti.static(1.0 / LARGEST_WAY) * grid.inverse_spacing
+    for c in ti.static(range(d)):
+        value[c] = scale * way[c]
         for a in ti.static(range(d)):
-            value[a] *= grid.fixed.pace[grid.fixed.run][2] * grid.inverse_spacing
-        if grid.fixed.scaled(mass, value, even):
-            add_linear(grid.fixed.nodes, grid, first, w, value, even, at.atomic)
+            change[a, c] = scale * slope[a, c]
+    value[d] = mass
+    if ti.static(grid.deterministic):
+        if grid.fixed.scaled(mass, value, change):
+            add_linear(grid.fixed.nodes, grid, first, w, value, change, at.atomic)
     else:
-        add_linear(grid.nodes, grid, first, w, value, even, at.atomic)
+        add_linear(grid.nodes, grid, first, w, value, change, at.atomic)
 
 
 @ti.func
@@ -373,7 +385,7 @@ def shift_to_float(at: ti.template(), node: ti.template(), time: float):
     index = grid.linear_index(node)
     grid.fixed.to_float(grid, index, 0.0)
     for a in ti.static(range(grid.dimension)):
-        grid.nodes[index][a] *= grid.spacing / grid.fixed.pace[grid.fixed.run][2]
+        grid.nodes[index][a] *= LARGEST_WAY * grid.spacing / grid.fixed.pace[grid.fixed.run][2]
 
 
 @ti.func

@@ -279,6 +279,10 @@ def relax_volume(group: ti.template(), grid: ti.template(), last: ti.template(),
         deformation, inner, change = group.law.relax(
             group.stored(p), group.inner(p), seen, opens, time * grid.inverse_spacing, group.constants(p)
         )
+        if ti.static(group.law.opens_at_surfaces and group.eased):
+            # A grain by itself sees too little to know how loose it is.
+            least_share = ti.static(1.0 / group.law.relief)
+            inner *= ti.min(2.0 * (group.borne[p] - least_share) / (1.0 - least_share), 1.0)
         group.store(p, deformation, inner)
     return change
 
