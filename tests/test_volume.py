@@ -166,7 +166,7 @@ def test_volume_follows_the_grid(
     The same step without relaxation differs by that alone: positions, velocities and gradients have the same bytes.
     """
     # Steps that relax also measure the share of its stress that a particle bears.
-    monkeypatch.setattr(Fluid, "eases", False)
+    monkeypatch.setattr(Fluid, "eases", ())
     monkeypatch.setenv(kernel_store.SWITCH, "off")
     run = build_run(pool(*densities, walls=walls, d=d), backend_of("f64"))
     (group,) = run.groups

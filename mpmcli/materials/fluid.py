@@ -309,7 +309,11 @@ class Fluid(Law):
 
     @ti.func
     def released(self, deformation: ti.template(), share: float):
-        return ti.max(deformation, 1.0) + share * ti.min(deformation - 1.0, 0.0)
+        opened = ti.max(deformation - 1.0, 0.0)
+        if ti.static(not self.relaxes):
+            # Only then does an opening mean suction.
+            opened *= share
+        return 1.0 + opened + share * ti.min(deformation - 1.0, 0.0)
 
     @ti.func
     def grown(self, J_minus_1: float, growth: float, constants: ti.template()):
