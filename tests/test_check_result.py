@@ -143,7 +143,7 @@ def test_energy_from_nowhere_is_found(run, checked, share, severity):
 
 def test_a_start_under_stress_is_named_as_a_cause(run):
     """Of energy that grows; a finding of another rule keeps its advice."""
-    grown = run.with_row(K, elastic=1e6, courant_max=0.6)
+    grown = run.with_row(K, elastic=1e6, courant_max=1.2)
     scene = run.header["scene"].replace("[[bodies]]", '[[bodies]]\ndeformation = "0.97"', 1)
     assert scene != run.header["scene"]
     plain, stressed = (
@@ -158,8 +158,8 @@ def test_a_start_under_stress_is_named_as_a_cause(run):
 @pytest.mark.parametrize(
     ("name", "value", "rule", "severity"),
     [
-        ("courant_max", 0.5, "courant", None),
-        ("courant_max", 0.6, "courant", "warning"),
+        ("courant_max", 1.05, "courant", None),
+        ("courant_max", 1.15, "courant", "warning"),
         ("courant_max", 1.9, "courant", "warning"),
         ("courant_max", 2.2, "courant", "error"),
         ("volume_ratio_min", 0.11, "volume", None),

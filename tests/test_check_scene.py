@@ -39,7 +39,7 @@ def limit(checked: SceneCheck, name: str, state: str, body: str = "block") -> fl
 
 
 def test_a_fluid_is_bounded_by_its_sound() -> None:
-    """1.6 h / (c sqrt(d)) at rest (6.1, 10.1); compressed to J = 1/(1 + v/c + g H/c^2) it is softer, and rest binds."""
+    """r h / (c sqrt(d)) at rest (6.1, 10.1); compressed to J = 1/(1 + v/c + g H/c^2) it is softer, and rest binds."""
     checked = check()
     c = math.sqrt(FLUID["bulk_modulus"] / FLUID["density"])
     assert limit(checked, "wave", "rest") == pytest.approx(Fluid.eases[0] * H / (c * math.sqrt(2)))
@@ -55,7 +55,7 @@ def test_a_fluid_with_tension_opens_and_becomes_stiffer() -> None:
     checked = check(material=FLUID | {"tension_cutoff": False})
     c = math.sqrt(FLUID["bulk_modulus"] / FLUID["density"])
     J = 1 + math.sqrt(2 * 10 * 0.25) / c + 10 * 0.25 / c**2
-    assert limit(checked, "wave", "stiffest") == pytest.approx(Fluid.eases[0] * H / (c * math.sqrt(2 * J)))
+    assert limit(checked, "wave", "stiffest") == pytest.approx(H / (c * math.sqrt(2 * J)))
     assert checked.facts.binding.state == "stiffest"
 
 
@@ -171,12 +171,12 @@ shape = {{ box = {{ min = [0.2, 0.2], max = [0.6, 0.6] }} }}
 """
 
 
-@pytest.mark.parametrize(("stable", "courant"), [(True, 0.73), (False, 1.3)])
+@pytest.mark.parametrize(("stable", "courant"), [(True, 0.512), (False, 0.8)])
 def test_mpm88_is_called_right(backend_of: Callable, tmp_path, stable: bool, courant: float) -> None:
-    """The block of Taichi's issue 3162, which has a limit of 1/sqrt(2) and explodes at a Courant number of 0.80.
+    """Taichi issue 3162: stable at a Courant number of 0.512 and exploding at 0.80; the limit is 1/sqrt(2).
 
-    Here the limit is 1.6/sqrt(2), because lone particles bear less stress. The solver, forced to that step, agrees.
-    The issue has steps of 2e-4 s and 200 cells.
+    A fluid with tension coheres, so that its lone particles bear all stress. The solver, forced to that step, agrees.
+    The issue has these numbers with steps of 2e-4 s and 128 and 200 cells.
     """
     path, step = tmp_path / "mpm88.toml", courant * H / 20
     path.write_text(MPM88.format(step=step))
@@ -186,8 +186,8 @@ def test_mpm88_is_called_right(backend_of: Callable, tmp_path, stable: bool, cou
     errors = [finding for finding in checked.findings if finding.severity == "error"]
     assert [finding.rule for finding in errors] == ([] if stable else ["step-above-limit"])
     if not stable:
-        assert errors[0].value == pytest.approx(courant * math.sqrt(2) / Fluid.eases[0])
-        assert f"{courant:.3f}" in errors[0].what and "1.131" in errors[0].what
+        assert errors[0].value == pytest.approx(courant * math.sqrt(2))
+        assert f"{courant:.3f}" in errors[0].what and "0.707" in errors[0].what
     outcome = run_here("check", path, "--json")
     assert (outcome.status, json.loads(outcome.stdout)["ok"]) == (0 if stable else 1, stable)
     solver = build_run(scene.scene, backend_of("f64", 1), force=True)

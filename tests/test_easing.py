@@ -7,6 +7,7 @@ from runpy import run_path
 
 import numpy as np
 import pytest
+from conftest import ROOT
 from solver_state import bodies_of, scene_of
 from test_batch import batch_of, outputs_of
 
@@ -14,7 +15,7 @@ from mpmcli.errors import InputError
 from mpmcli.materials.fluid import Fluid
 from mpmcli.materials.registry import parameter_models
 from mpmcli.materials.sand import Sand
-from mpmcli.scene import Scene, parse_scene, sample_bodies
+from mpmcli.scene import Scene, load_scene, parse_scene, sample_bodies
 from mpmcli.solver.engine.run import build_run
 from mpmcli.stability.transfer_factors import EASED_FROM, EASED_TO
 
@@ -22,7 +23,7 @@ H, C, G = 0.02, 20.0, 9.81
 WATER = {"law": "fluid", "density": 1000.0, "bulk_modulus": 1000.0 * C**2}
 JELLY = {"law": "neo_hookean", "density": 500.0, "youngs_modulus": 1e5}
 SAND = {"law": "sand", "density": 1600.0, "youngs_modulus": 1e6, "friction_angle": 30.0}
-SCRIPT = run_path(str(Path(__file__).parent.parent / "scripts" / "shared_steps"))
+SCRIPT = run_path(str(ROOT / "scripts" / "shared_steps"))
 
 
 def corner(precision: str) -> Scene:
@@ -76,7 +77,7 @@ def check_shares(scene: Scene, backend: object, tolerance: float) -> None:
     order = np.argsort(group.id.to_numpy()[: len(found)])
     found = group.borne.to_numpy()[: len(found)][order]
     assert found == pytest.approx(expected, abs=tolerance)
-    for kind in (expected == 1, expected < 0.4, (expected > 0.5) & (expected < 0.9)):
+    for kind in (expected == 1, expected < 0.45, (expected > 0.5) & (expected < 0.9)):
         assert kind.any()
 
 
@@ -147,6 +148,19 @@ def test_scattered_drops_gain_no_energy(
         record_property("least J", min(row.volume_ratio_min for row in rows))
         assert rise <= 1e-5 * np.ptp(energy)
         assert min(row.volume_ratio_min for row in rows) > 0.6
+
+
+def test_a_dam_breaks_at_the_whole_bound(backend_of: Callable) -> None:
+    """With `safety` = 1 the water of the example gains less than 2e-3 of the energy turned over until it meets the wall.
+
+    It gains 1.1e-3 in the impact; with a bound of 1.6 times that of a lone particle it gains 8e-3 before it.
+    """
+    changes = ["time.safety=1.0", "time.end=0.5", "time.frames=50"]
+    scene = load_scene(ROOT / "configs" / "dam_break_2d.toml", changes, laws=parameter_models()).scene
+    rows = [row for _, row in build_run(scene, backend_of("f32", 1)).frames()]
+    energy = np.array([row.kinetic + row.potential + row.elastic for row in rows])
+    rise = (energy - np.minimum.accumulate(energy)).max()
+    assert rise < 2e-3 * (rows[0].potential - rows[-1].potential)
 
 
 def test_lone_grains_stop_by_friction(backend_of: Callable, tmp_path: Path) -> None:

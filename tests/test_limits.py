@@ -9,7 +9,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from solver_state import bodies_of, scene_of
 
-from mpmcli.materials.fluid import Fluid
 from mpmcli.scene import sample_bodies
 from mpmcli.solver.engine.run import Run, build_run
 from mpmcli.solver.frames.diagnosis import UnstableRunError
@@ -21,39 +20,64 @@ MU, LAMBDA = E / (2 * (1 + NU)), E * NU / ((1 + NU) * (1 - 2 * NU))
 START = 1e-6
 
 
-MATERIALS = {
-    "solid": {"law": "neo_hookean", "density": RHO, "youngs_modulus": E, "poissons_ratio": NU},
-    # With the cut-off half of its oscillation would be free.
-    "liquid": {"law": "fluid", "density": RHO, "tension_cutoff": False},
-}
+def lone_particles(dimension: int) -> object:
+    """Return a scene of one fluid and one elastic particle, far apart, whose limits are equal.
 
+    h sqrt(rho / (d K)) for the fluid and h sqrt(rho / (d lambda + 2 mu)) for the solid: K = lambda + 2 mu / d.
+    """
+    d = dimension
+    side = {"particles_per_cell": 1}
 
-def started(backend_of: Callable, dimension: int, name: str) -> Run:
-    """Return a solver of a lone particle with C0 = START I, its most unstable mode; d K = d lambda + 2 mu."""
-    low = [0.32] + [0.33] * (dimension - 1)
-    material = MATERIALS[name]
-    if name == "liquid":
-        material = material | {"bulk_modulus": LAMBDA + 2 * MU / dimension}
-    body = {"material": material, "shape": {"box": {"min": low, "max": [c + H for c in low]}}}
-    scene = scene_of(
-        domain={"size": [0.8] * dimension, "spacing": H},
+    def cell(x: float) -> dict:
+        low = [x] + [0.33] * (d - 1)
+        return {"box": {"min": low, "max": [c + H for c in low]}}
+
+    return scene_of(
+        domain={"size": [1.6] + [0.8] * (d - 1), "spacing": H},
         time={"end": 1.0, "frames": 1},
         solver={"precision": "f64"},
-        bodies=[{"name": name, "particles_per_cell": 1} | body],
+        bodies=[
+            {
+                "name": "solid",
+                "material": {
+                    "law": "neo_hookean",
+                    "density": RHO,
+                    "youngs_modulus": E,
+                    "poissons_ratio": NU,
+                },
+                "shape": cell(0.32),
+                **side,
+            },
+            {
+                "name": "liquid",
+                # With the cut-off half of its oscillation would be free.
+                "material": {
+                    "law": "fluid",
+                    "density": RHO,
+                    "bulk_modulus": LAMBDA + 2 * MU / d,
+                    "tension_cutoff": False,
+                },
+                "shape": cell(1.07),
+                **side,
+            },
+        ],
     )
+
+
+def started(backend_of: Callable, dimension: int) -> Run:
+    """Return a solver of the lone particles with C0 = START I, their most unstable mode."""
+    scene = lone_particles(dimension)
     mode = START * np.eye(dimension)
     samples = [replace(s, affine=np.tile(mode, (s.count, 1, 1))) for s in sample_bodies(scene)]
-    assert [s.count for s in samples] == [1]
+    assert [s.count for s in samples] == [1, 1]
     return build_run(scene, backend_of("f64", 1), samples)
 
 
-def predicted(dimension: int, name: str) -> float:
-    """h / sqrt((d lambda + 2 mu) / rho) (10.1); a lone particle of a liquid bears eases^-2 of its stress."""
-    alone = H / np.sqrt((dimension * LAMBDA + 2 * MU) / RHO)
-    return alone * (Fluid.eases[dimension - 2] if name == "liquid" else 1.0)
+def predicted(dimension: int) -> float:
+    """h / sqrt((d lambda + 2 mu) / rho) (10.1)."""
+    return H / np.sqrt((dimension * LAMBDA + 2 * MU) / RHO)
 
 
-@pytest.mark.parametrize("name", MATERIALS)
 @pytest.mark.parametrize(
     ("dimension", "steps"),
     [
@@ -64,57 +88,58 @@ def predicted(dimension: int, name: str) -> float:
     ],
 )
 def test_a_lone_particle_is_stable_just_below_its_limit(
-    backend_of: Callable, dimension: int, steps: int, name: str, record_property: Callable
+    backend_of: Callable, dimension: int, steps: int, record_property: Callable
 ) -> None:
     """At 0.98 of the limit C stays of its size, for the fluid and the solid (10.3 T1).
 
     The step is a rotation in (C, tau dt / C scale) with trace 2 - 4 r^2 and determinant 1, so |C| stays below
     C0 / sqrt(1 - r^2) = 5.0 C0 at r = 0.98.
     """
-    run = started(backend_of, dimension, name)
-    dt = 0.98 * predicted(dimension, name)
+    run = started(backend_of, dimension)
+    dt = 0.98 * predicted(dimension)
     for limit in run.limits():
         if limit.name == "wave":
-            assert limit.value == pytest.approx(predicted(dimension, name), rel=1e-6)
-    largest = 0.0
+            assert limit.value == pytest.approx(predicted(dimension), rel=1e-6)
+    largest = {"solid": 0.0, "liquid": 0.0}
     for n in range(steps):
         run.step(dt)
         if n % 997 < 16 or n > steps - 50:
-            largest = max(largest, float(np.abs(bodies_of(run)[name].C).max()))
-    record_property("max |C|/C0", largest / START)
-    assert START / 2 < largest < 1.05 * START / np.sqrt(1 - 0.98**2)
+            for name, body in bodies_of(run).items():
+                largest[name] = max(largest[name], float(np.abs(body.C).max()))
+    for name, value in largest.items():
+        record_property(f"{name} max |C|/C0", value / START)
+        assert START / 2 < value < 1.05 * START / np.sqrt(1 - 0.98**2)
 
 
-@pytest.mark.parametrize("name", MATERIALS)
 @pytest.mark.parametrize("dimension", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_a_lone_particle_grows_just_above_its_limit(
-    backend_of: Callable, dimension: int, name: str, record_property: Callable
+    backend_of: Callable, dimension: int, record_property: Callable
 ) -> None:
     """At 1.02 of the limit |C| grows by |lambda| = 2 r^2 - 1 + 2 r sqrt(r^2 - 1) = 1.49 per step, past 1e3 (10.3)."""
-    run = started(backend_of, dimension, name)
+    run = started(backend_of, dimension)
     r = 1.02
     growth = 2 * r * r - 1 + 2 * r * np.sqrt(r * r - 1)
     n = 10
     # Within these the state stays far inside the linear range: 1e-6 x 1.49^25 dt = 1e-4.
     for _ in range(25 - n):
-        run.step(r * predicted(dimension, name))
-    middle = float(np.abs(bodies_of(run)[name].C).max())
+        run.step(r * predicted(dimension))
+    middle = {name: float(np.abs(body.C).max()) for name, body in bodies_of(run).items()}
     for _ in range(n):
-        run.step(r * predicted(dimension, name))
-    largest = float(np.abs(bodies_of(run)[name].C).max())
-    record_property("growth/step", (largest / middle) ** (1 / n))
-    assert largest > 1e3 * START
-    assert (largest / middle) ** (1 / n) == pytest.approx(growth, rel=0.01)
+        run.step(r * predicted(dimension))
+    for name, body in bodies_of(run).items():
+        largest = float(np.abs(body.C).max())
+        record_property(f"{name} growth/step", (largest / middle[name]) ** (1 / n))
+        assert largest > 1e3 * START
+        assert (largest / middle[name]) ** (1 / n) == pytest.approx(growth, rel=0.01)
 
 
-@pytest.mark.parametrize("name", MATERIALS)
-def test_an_unstable_particle_stops_the_run(backend_of: Callable, name: str) -> None:
+def test_an_unstable_particle_stops_the_run(backend_of: Callable) -> None:
     """Growth beyond the limit ends in an error that names a body, and never in numbers that are not finite."""
-    run = started(backend_of, 2, name)
+    run = started(backend_of, 2)
     with pytest.raises(UnstableRunError) as stopped:
         for _ in range(2000):
-            run.step(1.1 * predicted(2, name))
-    assert stopped.value.diagnosis.body == name
+            run.step(1.1 * predicted(2))
+    assert stopped.value.diagnosis.body in ("solid", "liquid")
 
 
 def test_bounds_are_their_formulas() -> None:

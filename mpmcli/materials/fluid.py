@@ -205,7 +205,7 @@ class Fluid(Law):
     coherent = True
     flows = True
     shifts = True
-    eases = (1.6, 1.8)
+    eases = (1.5, 1.8)
 
     def __init__(self, members: tuple[FluidParameters, ...], dimension: int) -> None:
         super().__init__(members, dimension)
@@ -217,6 +217,9 @@ class Fluid(Law):
         self.projects = any(member.tension_cutoff and not member.relaxes for member in members)
         self.grows_by_constants = self.relaxes and not self.all_relax
         cut = all(member.tension_cutoff for member in members)
+        if not cut:
+            # What coheres does not become weaker.
+            self.eases = ()
         self.sensitivity = 0.0 if self.linear and cut else max(member.exponent for member in members)
 
     def constants(self, parameters: FluidParameters) -> tuple[float, ...]:
@@ -309,11 +312,8 @@ class Fluid(Law):
 
     @ti.func
     def released(self, deformation: ti.template(), share: float):
-        opened = ti.max(deformation - 1.0, 0.0)
-        if ti.static(not self.relaxes):
-            # Only then does an opening mean suction.
-            opened *= share
-        return 1.0 + opened + share * ti.min(deformation - 1.0, 0.0)
+        # An opening causes hardly any stress.
+        return ti.max(deformation, 1.0) + share * ti.min(deformation - 1.0, 0.0)
 
     @ti.func
     def grown(self, J_minus_1: float, growth: float, constants: ti.template()):

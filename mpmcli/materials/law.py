@@ -111,7 +111,7 @@ class Law(ABC):
     coherent: ClassVar[bool] = False
     flows: ClassVar[bool] = False
     shifts: ClassVar[bool] = False
-    eases: ClassVar[tuple[float, ...]] = ()
+    eases: tuple[float, ...] = ()
     opens_at_surfaces: ClassVar[bool] = False
     lost: ClassVar[float] = 1.0
     elastic: ClassVar[bool] = False

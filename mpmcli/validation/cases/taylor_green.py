@@ -62,7 +62,7 @@ class TaylorGreen(Case):
     levels = {"coarse": (16, 32), "default": (16, 32, 64), "fine": (32, 64, 128)}  # noqa: RUF012
     measures = (
         text.measure("decay error", lambda n: 1.05 * excess(n) + 0.014, order=0.9, expected=3.0),
-        text.measure("decay unexplained", lambda n: 0.022 * (16 / n) ** 0.6),
+        text.measure("decay unexplained", lambda n: 0.02 * (16 / n) ** 0.6),
         # Damping by the transfers until END, and noise of the particles.
         text.measure("velocity error", lambda n: 1.25 * (1 - math.exp(-0.5 * DECAY * END * excess(n))) + 0.25 / n),
     )
