@@ -151,7 +151,7 @@ def test_scattered_drops_gain_no_energy(
 
 
 def test_a_dam_breaks_at_the_whole_bound(backend_of: Callable) -> None:
-    """With `safety` = 1 the water of the example gains less than 2e-3 of the energy turned over until it meets the wall.
+    """At `safety` = 1 the water of the example gains less than 2e-3 of the energy turned over when it meets the wall.
 
     It gains 1.1e-3 in the impact; with a bound of 1.6 times that of a lone particle it gains 8e-3 before it.
     """
