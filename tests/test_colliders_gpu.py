@@ -15,26 +15,28 @@ pytestmark = pytest.mark.gpu
 
 
 def test_a_run_on_a_gpu_follows_the_cpu(backend_of: Callable) -> None:
-    """Sixty equal steps between colliders at rest and moving: positions to round-off, forces to 1e-3.
+    """Equal steps between colliders at rest and moving: positions to round-off, forces after twenty to 1e-5.
 
-    One grain in ten may be elsewhere: the volume of those with J = 1 follows the grid at once or slowly.
+    Later, rounding decides where grains go: after sixty steps one in ten may be elsewhere, by less than 1e-3 m.
     """
     scene = scene_named("colliders")
     found = []
     for arch in ("vulkan", "cpu"):
         run = build_run(scene, backend_of("f32", 1, arch))
-        for _ in range(60):
+        for _ in range(20):
             run.step(2e-4)
-        frame, row = run.frame()
-        found.append((frame.position, np.array(row.collider_force), np.array(row.collider_torque)))
+        _, row = run.frame()
+        for _ in range(40):
+            run.step(2e-4)
+        found.append((run.frame()[0].position, np.array(row.collider_force), np.array(row.collider_torque)))
     (position, force, torque), (expected, expected_force, expected_torque) = found
     apart = np.abs(position - expected).max(axis=1)
     assert np.quantile(apart, 0.9) < 100 * np.finfo(np.float32).eps
     assert apart.max() < 1e-3
     scale = np.abs(expected_force).max()
     assert scale > 10
-    assert np.abs(force - expected_force).max() < 1e-3 * scale
-    assert np.abs(torque - expected_torque).max() < 1e-3 * np.abs(expected_torque).max()
+    assert np.abs(force - expected_force).max() < 1e-5 * scale
+    assert np.abs(torque - expected_torque).max() < 1e-5 * np.abs(expected_torque).max()
 
 
 @pytest.mark.slow

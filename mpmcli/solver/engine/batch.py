@@ -37,10 +37,11 @@ from mpmcli.solver.grid.sparse_grid import (
 )
 from mpmcli.solver.machine.backend import Backend
 from mpmcli.solver.particles.arrays import CONSTANTS, ParticleArrays
-from mpmcli.solver.particles.sort import SortBuffers, TileOrder
+from mpmcli.solver.particles.sort import CellOrder, SortBuffers, TileOrder
 from mpmcli.solver.transfer.node_update import NodeUpdate
 from mpmcli.solver.transfer.particle_update import BEYOND, ParticleUpdate
 from mpmcli.solver.transfer.redistribution import FineBlocks, FineGrid
+from mpmcli.solver.transfer.run_sums import scatters_runs
 from mpmcli.solver.transfer.splines import PAD, scheme_of
 from mpmcli.solver.transfer.volume import averages_volume, levels_volume
 
@@ -195,7 +196,8 @@ class Batch:
 
     def _make_orders(self, groups: Sequence[ParticleArrays], grid: Grid) -> list[TileOrder]:
         """Return the tile order of each group."""
-        kind = BlockOrder if grid.sparse else TileOrder
+        by_cells = scatters_runs(grid) and not self.backend.on_cpu
+        kind = BlockOrder if grid.sparse else CellOrder if by_cells else TileOrder
         sharing = self.backend.threads if self.runs == 1 else 1
         return [kind(group, grid, self.sort_buffers, sharing, self.runs) for group in groups]
 

@@ -22,10 +22,11 @@ from mpmcli.solver.engine.device import Device, RunPhases, RunView, Work
 from mpmcli.solver.engine.emission import GpuEmission
 from mpmcli.solver.engine.run_state import ATTEND, GOING, MEASURE, Layout, RunState
 from mpmcli.solver.engine.step import sorted_fields
-from mpmcli.solver.engine.step_size import StepSize
+from mpmcli.solver.engine.step_size import SLACK, StepSize
 from mpmcli.solver.frames.columns import FrameColumns
 from mpmcli.solver.frames.reader import chosen_columns, write_range
 from mpmcli.solver.grid.grid import box_of
+from mpmcli.solver.machine.backend import launcher
 from mpmcli.solver.machine.maxima import Maxima
 from mpmcli.solver.particles.sort import SPAN, keep, take
 from mpmcli.solver.particles.state_bounds import (
@@ -39,6 +40,16 @@ from mpmcli.solver.particles.state_bounds import (
 from mpmcli.solver.transfer.cpu_transfers import nodes_of_rows
 from mpmcli.solver.transfer.lanes import LANES
 from mpmcli.solver.transfer.particle_update import NOT_LOST, ParticleUpdate
+from mpmcli.solver.transfer.run_sums import (
+    WARP,
+    RunSums,
+    flush,
+    in_blocks,
+    run_length,
+    scatters_runs,
+    stored_at,
+    thread_count,
+)
 from mpmcli.solver.transfer.splines import PAD
 from mpmcli.solver.transfer.volume import add_volume, clear_mean, missing_to_mean
 from mpmcli.stability.transfer_factors import INTERVAL
@@ -75,6 +86,7 @@ class GpuPhases(RunPhases):
         self.counts = ti.field(ti.i32, shape=(device.runs, layout.widths["counts"]))
         self.numbers = double_field(device.runs, layout.widths["numbers"]) if doubles else None
         self.peaks = Maxima(device.runs, 1 + 2 * len(device.groups))
+        self.stencil = device.grid.scheme.spline.nodes**device.grid.dimension
 
     @ti.func
     def forget_peaks(self, w: int):
@@ -187,9 +199,27 @@ class GpuPhases(RunPhases):
         """Scatter a particle."""
         layer = at.group.layer_of(at.q)
         (particles,) = ti.static((self.particles_in(at, layer),))
-        particles.scatter(at.g, at.group, at.q, at.step.kick, at.step.relaxed)
+        particles.scatter(at.g, at.group, at.q, at.step.kick, at.step.relaxed, None)
 
-    def particles_in(self, at: Item, layer: object) -> ParticleUpdate:
+    @ti.func
+    def scatter_run(self, g: ti.template(), w: int, thread: int, length: ti.template()):
+        """Scatter the particles of a thread of a run, see `run_sums`."""
+        (run,) = ti.static((self.run(w),))
+        (view,) = ti.static(self.see(run))
+        sums, stencil = ti.Matrix.zero(float, ti.static(self.stencil), ti.static(self.device.grid.width)), -1
+        (own,) = ti.static((RunSums(self.device.grid, sums, stencil),))
+        p = thread // WARP * (WARP * length) + thread % WARP
+        for _ in range(length):
+            if p < run.particles[g]:
+                layer = view.groups[g].layer_of(w * ti.static(self.device.capacity[g]) + p)
+                (particles,) = ti.static((self.particles_in(view, layer),))
+                (step,) = ti.static((view.step,))
+                place = w * ti.static(self.device.capacity[g]) + p
+                particles.scatter(g, view.groups[g], place, step.kick, step.relaxed, own)
+            p += WARP
+        flush(own)
+
+    def particles_in(self, at: Item | RunView, layer: object) -> ParticleUpdate:
         """Return the particle update with the nodes of a layer, which is a variable of a kernel."""
         return at.particles if at.grid.layers == 1 else at.particles.with_nodes(at.grid.in_layer(layer, None))
 
@@ -198,6 +228,12 @@ class GpuPhases(RunPhases):
         """Convert the sums of a node from fixed point."""
         if at.q < at.grid.box_nodes():
             at.grid.fixed.to_float(at.grid, at.grid.linear_index(at.grid.box_node(at.q)), at.step.relaxed)
+
+    @ti.func
+    def relaxes(self, w: int):
+        """Return whether the step of a run relaxes volumes."""
+        (step,) = ti.static((self.step_of(w),))
+        return step.relaxed > 0.0
 
     @ti.func
     def relax(self, at: ti.template()):
@@ -294,12 +330,19 @@ class GpuPhases(RunPhases):
         return view.grid.box_nodes(), planes, view.grid.row_count()
 
 
-# Largest number of steps of a launch, after which the host handles the runs that need it.
-STEPS = 32
+# Largest number of steps of a launch, after which the host handles the runs that need it; at most twice as many as the
+# last one took before it waited for the host. It takes as long as some steps of a small scene to exchange the numbers.
+STEPS = 128
+# Distance, cells, that the fastest particle moves before particles are sorted again, if there are MANY, for the sake of
+# `run_sums`: with fewer a sort takes longer than the atomics that it saves.
+AGED, MANY = 0.3, 2**19
 # Launches of a step: the shift of particles, in few steps; all other phases, or if one has rounds those before it; a
 # round of this one. Each turn of a later phase is a launch of its own, because drivers may take minutes to compile
 # these phases together with others.
 SHIFT, FIRST, ROUND = range(3)
+# Threads of loops whose number of items only the device knows: enough to fill a large GPU, and elsewhere fewer, because
+# software Vulkan takes half a microsecond for each.
+WORKERS = {True: 2**17, False: 2**13}
 # Items of phases other than particles, see `Phase`.
 OVER = ("nodes", "planes", "rows", "loads", "runs", "threads")
 
@@ -311,7 +354,10 @@ class GpuLaunch:
     Attributes:
         phases: bodies of the phases, and the numbers of runs that they read.
         steps: choice of steps.
-        parts: phases of each launch of a step, with their turns.
+        parts: phases of each launch of a step, with their turns, apart from `clear` and `relaxing`.
+        clear: the first phase, which runs while steps begin.
+        relaxing: phases that run while walls find what presses on them.
+        by_runs: whether a thread scatters several particles, see `run_sums`.
         doubles: whether the device has double precision.
         shifts: whether some steps shift particles.
         reach: largest number of items per run of each kind, see OVER.
@@ -322,13 +368,19 @@ class GpuLaunch:
         self.device, self.layout, self.doubles = device, layout, doubles
         self.dimension, self.runs, groups = device.grid.dimension, device.runs, device.groups
         self.capacity, self.members = tuple(device.capacity), tuple(enumerate(groups))
-        self.phases, self.shifts = (
-            GpuPhases(device, layout, doubles=doubles),
-            any(phase.shifts for phase in device.phases),
-        )
+        self.phases = GpuPhases(device, layout, doubles=doubles)
+        self.shifts = any(phase.shifts for phase in device.phases)
         self.parts = self._parts()
+        self.step_threads = WORKERS[ti.lang.impl.current_cfg().arch == ti.cuda]
+        self.turn_threads = in_blocks(self.runs + self.step_threads)
+        self.clear = self.parts[FIRST].pop(0)[0]
+        phases = [phase for phase, _ in self.parts[FIRST]]
+        pressed = any(phase.name == "find_contact" for phase in phases)
+        self.relaxing = [phase for phase in phases if phase.name == "relax" and pressed]
+        self.parts[FIRST] = [one for one in self.parts[FIRST] if one[0] not in self.relaxing]
         self.steps = StepSize.of(device, layout, device.values if doubles else HostValues(device.values))
         self.sorts, self.moved = device.sorts, sorted_fields(groups)
+        self.by_runs = device.sorts and scatters_runs(device.grid)
         self.averages = any(group.uses_f_bar for group in groups)
         loads = device.features.colliders and device.features.colliders.loads
         self.loads = loads.rows * loads.capacity if loads else 0
@@ -344,7 +396,12 @@ class GpuLaunch:
         self.emission = GpuEmission(device, layout, self.counts) if device.features.emission else None
         self.readers = [self._reader(g) for g in range(len(groups))]
         self.compile_seconds = 0.0
-        self._called: set[tuple] = set()
+        self._launches: dict[tuple, Callable[[], None]] = {}
+        self._most_steps = STEPS // 4
+        self._domains_written: np.ndarray | None = None
+        # Distance, cells, that the fastest particle has moved since particles were sorted.
+        self._age = 0.0
+        self._sorts_again = self.by_runs and sum(self.capacity) * runs >= MANY and not self.device.particle_count_varies
 
     # A launch.
 
@@ -352,7 +409,7 @@ class GpuLaunch:
         """Advance all runs; `numbers` and `counts` are those of `Batch`."""
         runs = self.phases.state(slice(None), numbers, counts)
         going = (runs.status == GOING) & (runs.budget > 0)
-        self.phases.values.from_numpy(self._domains(runs))
+        self._write_domains(runs)
         if going.any():
             if self.emission is not None:
                 self.emission.enter(runs, going)
@@ -362,6 +419,13 @@ class GpuLaunch:
         else:
             self.counts.from_numpy(counts)
         self._measure(runs)
+
+    def _write_domains(self, runs: RunState) -> None:
+        """Write the values of the domains to the numbers of steps if they have changed."""
+        values = self._domains(runs)
+        if not np.array_equal(values, self._domains_written):
+            self.phases.values.from_numpy(values)
+            self._domains_written = values
 
     def _domains(self, runs: RunState) -> np.ndarray:
         """Return the numbers of steps (see STEP) with the values of the domains set."""
@@ -374,12 +438,27 @@ class GpuLaunch:
     def _take_steps(self, runs: RunState, numbers: np.ndarray, counts: np.ndarray, going: np.ndarray) -> None:
         """Take steps chosen by the device until a run must be sorted."""
         self.numbers.from_numpy(numbers)
-        room = self.device.drift_allowed - runs.drift[going]
-        steps = np.min(room / np.maximum(runs.courant[going], 1e-3), initial=STEPS)
-        waited = runs.unrelaxed_steps[going].copy()
-        for k in range(max(1, min(STEPS, int(steps), int(runs.budget[going].max())))):
+        waited, before = runs.unrelaxed_steps[going].copy(), runs.step_count[going].copy()
+        if self._sorts_again:
+            self.sorting.from_numpy(going.astype(np.int32))
+        for k in range(self._steps_ahead(runs, going)):
+            if self._sorts_again and self._age >= AGED:
+                self._sort()
+            self._age += float(runs.courant[going].max())
             self._take_step(shifts=self.shifts and ((waited + k + 1) % INTERVAL == 0).any())
+        self._call(self.finish)
         numbers[:], counts[:] = self.numbers.to_numpy(), self.counts.to_numpy()
+        self._most_steps = min(STEPS, 2 * max(1, int((runs.step_count[going] - before).max())))
+
+    def _steps_ahead(self, runs: RunState, going: np.ndarray) -> int:
+        """Return the number of steps until the host visits the runs again."""
+        room = self.device.drift_allowed - runs.drift[going]
+        steps = np.min(room / np.maximum(runs.courant[going], 1e-3), initial=self._most_steps)
+        # Steps of runs that have arrived, or wait for the host, would do nothing.
+        pace = np.where(runs.given > 0, runs.given, runs.last_step)[going]
+        left = (np.minimum(runs.target, runs.due) - runs.time)[going] / np.maximum(pace, 1e-30)
+        left = np.ceil(np.max(np.minimum(left, STEPS)) - SLACK)
+        return max(1, int(min(steps, left, runs.budget[going].max())))
 
     def _take_host_step(self, runs: RunState, numbers: np.ndarray, counts: np.ndarray, going: np.ndarray) -> None:
         """Take a step chosen by the host."""
@@ -392,6 +471,7 @@ class GpuLaunch:
         self.stepping.from_numpy(stepping)
         self.phases.values.from_numpy(values)
         self._take_step(shifts=self.shifts and (runs.relaxed[stepping == 1] > 0).any())
+        self._call(self.finish)
         steps = self.phases.step_on_host(self.phases.values.to_numpy())
         lost = self.device.particles.lost.to_numpy().reshape(self.runs, -1)
         for w in np.flatnonzero(stepping).tolist():
@@ -412,10 +492,13 @@ class GpuLaunch:
 
     def _call(self, kernel: Callable, *arguments: int) -> None:
         """Call a kernel, and measure its first call with these arguments."""
-        began = time.perf_counter()
-        kernel(*arguments)
-        if (kernel.__name__, *arguments) not in self._called:
-            self._called.add((kernel.__name__, *arguments))
+        name = (kernel.__name__, *arguments)
+        if name in self._launches:
+            self._launches[name]()
+        else:
+            began = time.perf_counter()
+            kernel(*arguments)
+            self._launches[name] = launcher(kernel, *arguments)
             self.compile_seconds += time.perf_counter() - began
 
     def _parts(self) -> list[list[tuple[Phase, int]]]:
@@ -435,30 +518,76 @@ class GpuLaunch:
 
     @ti.kernel
     def step(self, part: ti.template()):
-        """Carry out one launch of a step of all advancing runs; the first begins the step, the last ends it."""
+        """Carry out one launch of a step of all advancing runs; the first begins the step."""
         if ti.static(part in (SHIFT, FIRST)):
-            for w in range(self.runs):
-                if ti.static(self.doubles):
-                    if self.begun[w] == 0:
-                        self.begin(w)
-                    self.begun[w] = ti.static(int(part == SHIFT)) * self.stepping[w]
-                self.prepare(w)
+            for t in range(ti.static(self.turn_threads if part == FIRST else self.runs)):
+                # Few threads update the numbers of runs while others clear the nodes, also those of runs at rest.
+                if t < self.runs:
+                    self.turn(t, part)
+                elif ti.static(part == FIRST):
+                    q = t - self.runs
+                    while q < self.runs * self.reach[0]:
+                        self.phases.do(self.clear, 0, q // self.reach[0], q % self.reach[0])
+                        q += ti.static(self.turn_threads - self.runs)
         for phase, turn in ti.static(self.parts[part]):
-            if ti.static(phase.over != "particles"):
-                kind = ti.static(OVER.index(phase.over))
-                for q in range(self.runs * self.reach[kind]):
-                    w = q // self.reach[kind]
+            if ti.static(phase.over != "particles" or phase.name == "relax"):
+                # A loop over all items would need a kernel that computes their number.
+                for t in range(self.step_threads):
+                    if ti.static(phase.name == "find_contact"):
+                        for beside in ti.static(self.relaxing):
+                            self.each_of(beside, 0, t)
+                    self.each_of(phase, turn, t)
+            elif ti.static(phase.name == "scatter" and self.by_runs):
+                threads = ti.static(thread_count(self.capacity[phase.group]))
+                for q in range(self.runs * threads):
+                    w = q // threads
                     if self.stepping[w] == 1:
-                        self.phases.do(phase, turn, w, q % self.reach[kind])
-            if ti.static(phase.over == "particles"):
+                        length = ti.static(run_length(self.capacity[phase.group]))
+                        self.phases.scatter_run(phase.group, w, q % threads, length)
+            elif ti.static(phase.over == "particles"):
                 for p in range(self.runs * self.capacity[phase.group]):
                     w = p // self.capacity[phase.group]
                     if self.stepping[w] == 1 and self.takes_part(phase.group, w, p):
                         self.phases.do(phase, turn, w, p)
-        if ti.static(part == len(self.parts) - 1):
+
+    @ti.kernel
+    def finish(self):
+        """Finish the last step of a launch."""
+        for w in range(self.runs):
+            if self.stepping[w] == 1:
+                self.end(w)
+            self.stepping[w] = 0
+
+    @ti.func
+    def each_of(self, phase: ti.template(), turn: ti.template(), t: int):
+        """Carry out the share of thread t in one turn of a phase."""
+        q = t
+        if ti.static(phase.over == "particles"):
             for w in range(self.runs):
+                (run,) = ti.static((self.phases.run(w),))
+                if self.stepping[w] == 1 and self.phases.relaxes(w):
+                    q = t
+                    while q < run.particles[phase.group]:
+                        self.phases.do(phase, turn, w, w * ti.static(self.capacity[phase.group]) + q)
+                        q += self.step_threads
+        else:
+            kind = ti.static(OVER.index(phase.over))
+            while q < self.runs * self.reach[kind]:
+                w = q // self.reach[kind]
+                if self.stepping[w] == 1:
+                    self.phases.do(phase, turn, w, q % self.reach[kind])
+                q += self.step_threads
+
+    @ti.func
+    def turn(self, w: int, part: ti.template()):
+        """Finish the previous step of a run in this launch, if any, and begin the next."""
+        if ti.static(self.doubles):
+            if self.begun[w] == 0:
                 if self.stepping[w] == 1:
                     self.end(w)
+                self.begin(w)
+            self.begun[w] = ti.static(int(part == SHIFT)) * self.stepping[w]
+        self.prepare(w)
 
     @ti.func
     def takes_part(self, g: ti.template(), w: int, p: int):
@@ -544,8 +673,7 @@ class GpuLaunch:
             return
         self.sorting.from_numpy(due.astype(np.int32))
         if self.sorts:
-            for g in range(len(self.members)):
-                self._call(self.sort, g)
+            self._sort()
             if self.device.particle_count_varies:
                 active = self.active.to_numpy()
                 for g in range(len(self.members)):
@@ -555,11 +683,17 @@ class GpuLaunch:
         runs.drift[due] = 0.0
         self.counts.from_numpy(counts)
 
+    def _sort(self) -> None:
+        """Sort the particles of the runs that are marked in `sorting`."""
+        for g in range(len(self.members)):
+            self._call(self.sort, g)
+        self._age = 0.0
+
     @ti.kernel
     def sort(self, g: ti.template()):
         """Sort the particles of a group by tile, in the runs that are marked."""
         order, buffers = ti.static((self.device.orders[g], self.device.orders[g].buffers))
-        bins, spans, room = ti.static((order.bins, order.spans, self.capacity[g]))
+        bins, spans, blocks, room = ti.static((order.bins, order.spans, order.blocks, self.capacity[g]))
         for q in range(self.runs * bins):
             if self.sorting[q // bins] == 1:
                 order.cursor[q, 0] = 0
@@ -574,28 +708,35 @@ class GpuLaunch:
             for q in range(s % spans * SPAN, ti.min(bins, (s % spans + 1) * SPAN)):
                 total += order.cursor[s // spans * bins + q, 0]
             order.span_sum[s] = total
-        for w in range(self.runs):
-            if self.sorting[w] == 1:
-                before = w * room
-                for s in range(w * spans, (w + 1) * spans):
-                    size = order.span_sum[s]
-                    order.span_sum[s] = before
-                    before += size
-                order.start[w * (bins + 1) + bins] = before
+        for b in range(self.runs * blocks):
+            total = 0
+            for s in range(b % blocks * SPAN, ti.min(spans, (b % blocks + 1) * SPAN)):
+                total += order.span_sum[b // blocks * spans + s]
+            order.block_sum[b] = total
         for s in range(self.runs * spans):
             w = s // spans
             if self.sorting[w] == 1:
-                place = order.span_sum[s]
+                place = w * room
+                block = s % spans // SPAN
+                for b in range(w * blocks, w * blocks + block):
+                    place += order.block_sum[b]
+                for t in range(w * spans + block * SPAN, s):
+                    place += order.span_sum[t]
                 for q in range(s % spans * SPAN, ti.min(bins, (s % spans + 1) * SPAN)):
                     size = order.cursor[w * bins + q, 0]
                     order.start[w * (bins + 1) + q] = place
                     order.cursor[w * bins + q, 0] = place
                     place += size
+                if s % spans == spans - 1:
+                    order.start[w * (bins + 1) + bins] = place
         for p in range(self.runs * room):
             w = p // room
             if self.is_sorted(g, w, p):
-                own = w * buffers.capacity - w * room
-                place = ti.atomic_add(order.cursor[w * bins + buffers.key[own + p], 0], 1)
+                own = w * buffers.capacity
+                place = ti.atomic_add(order.cursor[w * bins + buffers.key[own + p - w * room], 0], 1) - w * room
+                if ti.static(self.by_runs):
+                    active = order.start[w * (bins + 1) + ti.static(order.tiles)] - w * room
+                    place = stored_at(place, active, ti.static(run_length(room)))
                 buffers.order[own + place] = p
         for field in ti.static(self.moved[g]):
             for p in range(self.runs * room):
@@ -673,7 +814,7 @@ class GpuLaunch:
     def begin_frame(self, numbers: np.ndarray, counts: np.ndarray) -> None:
         """Prepare the device for `read`."""
         if self.averages:
-            self.phases.values.from_numpy(self._domains(self.phases.state(slice(None), numbers, counts)))
+            self._write_domains(self.phases.state(slice(None), numbers, counts))
             self.counts.from_numpy(counts)
             self.average_for_frame()
 

@@ -15,7 +15,7 @@ from mpmcli.solver.particles.arrays import ParticleArrays
 
 # Taichi gives a CPU thread at least this many iterations of a parallel loop.
 CHUNK = 512
-# Tiles per entry of the two-level prefix sum.
+# Tiles per entry of a level of the prefix sum.
 SPAN = 256
 
 
@@ -74,7 +74,7 @@ class TileOrder:
 
     def __init__(self, group: ParticleArrays, grid: Grid, buffers: SortBuffers, threads: int, runs: int = 1) -> None:
         self.group, self.grid, self.buffers, self.threads = group, grid, buffers, threads
-        self.tiles = grid.tile_count
+        self.tiles = self.bins_of(grid)
         # If particles come and go, the tiles are followed by a bin of waiting and blocked particles and a bin of
         # retired ones.
         self.particle_count_varies = group.particle_count_varies
@@ -82,11 +82,17 @@ class TileOrder:
         self.extent = tuple(n * grid.spacing for n in grid.cells)
         self.colours = 2 ** (grid.dimension - 1)
         self.spans = -(-self.bins // SPAN)
+        self.blocks = -(-self.spans // SPAN)
         self.first_tile = 0
         self.start = ti.field(int, shape=runs * (self.bins + 1))
         self.cursor = ti.field(int, shape=(runs * self.bins, threads))
-        self.span_sum = ti.field(int, shape=runs * self.spans)
+        self.span_sum, self.block_sum = ti.field(int, shape=runs * self.spans), ti.field(int, shape=runs * self.blocks)
         self.work = ti.field(int, shape=(self.colours, threads + 1))
+
+    @staticmethod
+    def bins_of(grid: Grid) -> int:
+        """Return the number of bins of active particles."""
+        return grid.tile_count
 
     @ti.func
     def first_node_of(self, p: int):
@@ -179,6 +185,19 @@ class TileOrder:
     def first_particle_of(self, pencil: int):
         """Return the first particle of a pencil; after the last pencil, the index after the last particle."""
         return self.start[self.first_tile + self.first_tile_of(pencil)]
+
+
+@ti.data_oriented
+class CellOrder(TileOrder):
+    """The order of one group on a GPU: its tiles are single cells, so that neighbours in memory share a stencil."""
+
+    @staticmethod
+    def bins_of(grid: Grid) -> int:
+        return grid.node_count
+
+    @ti.func
+    def tile_of(self, p: int):
+        return self.grid.linear_index(self.first_node_of(p)) - self.grid.first_node
 
 
 @ti.func

@@ -12,6 +12,7 @@ from mpmcli.solver.grid.period import opaque
 from mpmcli.solver.particles.arrays import MASS, VOLUME
 from mpmcli.solver.particles.state_bounds import deformation_rate, volume_ratio
 from mpmcli.solver.transfer.particle_step import Loads, NodeSums, Receiver, Sender, g2p, loads_on, p2g
+from mpmcli.solver.transfer.run_sums import RunSums, move_to
 from mpmcli.solver.transfer.splines import PAD
 from mpmcli.solver.transfer.stencils import add_linear, columns, gather_linear
 from mpmcli.solver.transfer.volume import level_volume, missing_growth, relax_volume
@@ -109,8 +110,11 @@ class ParticleUpdate:
         return result
 
     @ti.func
-    def scatter(self, g: ti.template(), group: ti.template(), p: int, kick: float, relaxed: float):
-        """Scatter one particle, with atomics; a crushed particle is lost, because its stress would spread NaN."""
+    def scatter(self, g: ti.template(), group: ti.template(), p: int, kick: float, relaxed: float, run: ti.template()):
+        """Scatter one particle to the `RunSums` of the thread, or with atomics; a crushed one is lost.
+
+        Its stress would spread NaN.
+        """
         state, row = group.stored(p), group.row(p)
         if volume_ratio(group, state) > SMALLEST_J:
             (grid,) = ti.static((self.near,))
@@ -128,7 +132,10 @@ class ParticleUpdate:
             if ti.static(group.law.projects):
                 group.change(p, plastic, inner_after)
             w, first = grid.scheme.spline.weights(distance), grid.linear_index(base)
-            if ti.static(grid.deterministic):
+            if ti.static(isinstance(run, RunSums)):
+                move_to(run, first)
+                add_linear(run, grid, first, w, middle, change, False)
+            elif ti.static(grid.deterministic):
                 if not add_fixed(grid.fixed.nodes, grid, first, w, row[MASS], middle, change):
                     grid.fixed.note(group.id[p])
             else:

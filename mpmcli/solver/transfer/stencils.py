@@ -7,6 +7,7 @@ has one more node, at 2. On the CPU every node is four numbers wide, which the c
 
 from mpmcli.quick_taichi import ti
 from mpmcli.solver.grid.fixed_point import FixedSums
+from mpmcli.solver.transfer.run_sums import RunSums
 from mpmcli.solver.transfer.splines import LOW_BITS, bounded
 
 
@@ -23,7 +24,8 @@ def add_linear(
     """Add to the nodes of a stencil a quantity that varies linearly over it, weighted by the spline.
 
     Args:
-        field: field of the nodes, or sums in fixed point, for which the quantity is already scaled.
+        field: field of the nodes, or sums in fixed point, for which the quantity is already scaled, or the `RunSums` of
+            a thread.
         first: `stencil_at` of the first node.
         middle: the quantity at the middle node.
         change: its change per cell, a row per axis.
@@ -46,11 +48,11 @@ def add_linear(
             add_multiple(line, ti.static(j - 1), across)
             line *= w[j, d - 2]
             step = along * w[j, d - 2]
-            add(field, node_of(origin, grid, i, j, 0), (line - step) * w[0, d - 1], atomic)
-            add(field, node_of(origin, grid, i, j, 1), line * w[1, d - 1], atomic)
-            add(field, node_of(origin, grid, i, j, 2), (line + step) * w[2, d - 1], atomic)
+            put(field, origin, grid, (i, j, 0), (line - step) * w[0, d - 1], atomic)
+            put(field, origin, grid, (i, j, 1), line * w[1, d - 1], atomic)
+            put(field, origin, grid, (i, j, 2), (line + step) * w[2, d - 1], atomic)
             if ti.static(grid.scheme.spline.nodes == 4):
-                add(field, node_of(origin, grid, i, j, 3), (line + 2.0 * step) * w[3, d - 1], atomic)
+                put(field, origin, grid, (i, j, 3), (line + 2.0 * step) * w[3, d - 1], atomic)
 
 
 @ti.func
@@ -100,6 +102,23 @@ def add_multiple(result: ti.template(), factor: ti.template(), vector: ti.templa
             result[c] += vector[c]
         if ti.static(factor == 2):
             result[c] += 2.0 * vector[c]
+
+
+@ti.func
+def put(
+    field: ti.template(),
+    origin: int,
+    grid: ti.template(),
+    at: ti.template(),
+    share: ti.template(),
+    atomic: ti.template(),
+):
+    """Add a share to node k of line j in plane i of a stencil, `at` = (i, j, k)."""
+    if ti.static(isinstance(field, RunSums)):
+        for c in ti.static(range(share.n)):
+            field.sums[ti.static(field.row(at)), c] += share[c]
+    else:
+        add(field, node_of(origin, grid, at[0], at[1], at[2]), share, atomic)
 
 
 @ti.func
