@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import GPU
 from test_batch import batch_of, outputs_of, scene_named
 from tiny_sweep import tiny_sweep
 
@@ -74,10 +75,10 @@ def test_a_sweep_computes_many_at_once(tmp_path: Path) -> None:
     """All trajectories of a task, stored as on the CPU."""
     sweep = tiny_sweep(tmp_path, 6)
     found = {}
-    for arch in ("vulkan", "cpu"):
+    for arch in (GPU, "cpu"):
         rows = compute(Task(tmp_path / arch, sweep, tuple(range(6)), arch))
         assert [row.verdict for row in rows] == ["stable"] * 6 and {row.arch for row in rows} == {arch}
         assert all((tmp_path / arch / row.file).exists() and row.seconds > 0 for row in rows)
         found[arch] = rows
-    for row, other in zip(found["vulkan"], found["cpu"], strict=True):
+    for row, other in zip(found[GPU], found["cpu"], strict=True):
         assert (row.steps, row.particles, row.frames) == (other.steps, other.particles, other.frames)
