@@ -533,6 +533,30 @@ def test_a_pose_that_is_not_finite_stops_the_run(backend_of: Callable) -> None:
         list(frames)
 
 
+@pytest.mark.parametrize("restitution", [1.0, 0.7])
+@pytest.mark.parametrize(("step", "shift"), [(1.5e-3, 0.0), (1.5e-3, 0.013), (5e-4, 0.0), (2e-4, 0.0)])
+def test_a_disc_hits_a_rod_off_its_centre(backend_of: Callable, restitution: float, step: float, shift: float) -> None:
+    """Without friction: the impulse (1 + e) v / (1/m + 1/M + b^2/I) at one point, at any step and any time of it."""
+    b, v = 0.21, 1.6
+    disc = {"shape": {"ball": {"center": [0.22 - shift, 0.72], "radius": 0.12}}, "velocity": [v, 0.0]}
+    rod = {"shape": box([0.62, 0.51 - 0.35], [0.68, 0.51 + 0.35]), "density": 1400.0}
+    asked = scene(
+        2,
+        0.0,
+        disc | {"density": 1000.0, "restitution": restitution},
+        rod | {"restitution": restitution},
+        jelly=CORNER,
+        time={"end": 0.4, "frames": 2, "step": step},
+        domain={"walls": "separate"},
+    )
+    m, M = (asked.colliders[k].moments.mass for k in range(2))
+    inertia = asked.colliders[1].moments.inertia[0, 0]
+    impulse = (1 + restitution) * v / (1 / m + 1 / M + b**2 / inertia)
+    _, rates = moved(asked, backend_of("f64", 1))
+    expected = [[v - impulse / m, 0.0, 0.0], [impulse / M, 0.0, -impulse * b / inertia]]
+    assert rates[-1, :2] == pytest.approx(np.array(expected), abs=1e-3)
+
+
 @pytest.mark.parametrize("restitution", [0.0, 0.6, 1.0])
 def test_a_ball_bounces(backend_of: Callable, restitution: float) -> None:
     """From a height H to e^2 H, e^4 H, ... of it, to the first order in the step."""

@@ -4,7 +4,12 @@ Each point touches only the nearest obstacle. The point of a ball is that which 
 points are found by sweeps of projected Gauss-Seidel; they do not pull, and obey Coulomb friction. A point that would
 penetrate a surface in the step ends on it, or separates from it according to the coefficient of restitution. A fraction
 of an existing penetration is removed in each step.
+
+A step in which a point is near a surface has parts, in which bodies move and turn little: points that touch later in
+the step have no share of an earlier impulse.
 """
+
+import math
 
 import numpy as np
 
@@ -28,10 +33,15 @@ LOOKS = 2
 # Coefficient of friction of sticking surfaces; codes of a wall and of no obstacle in place of the index of a collider.
 STUCK = 1e3
 WALL, NOTHING = -1, -2
+# What `look_at_all` returns.
+FAR, NEXT = 0.0, 0.5
 # Rebound of a point that may pass a surface in this step and separates from it in the next.
 LATER = -1.0
-# Turns of the phase that moves bodies: they take the momentum from nodes, their contact is resolved, and they move.
-MOVES = 3
+# Turns of the phase that moves bodies: they take the momentum from nodes, and move, while their contact is resolved.
+MOVES = 2
+# Distance in cells by which a point approaches a surface and angle, rad, by which its body turns in a part of a step;
+# largest number of parts.
+PART_WAY, PART_TURN, MOST_PARTS = 1 / 16, 2 * math.pi / 50, 32
 
 
 @ti.func
@@ -51,17 +61,33 @@ def move_item(phases: ti.template(), at: ti.template()):
 
 @ti.func
 def move_bodies(phases: ti.template(), at: ti.template(), turn: ti.template()):
-    """Transfer momentum from nodes to rigid bodies (turn 0), resolve their contact (1), or move them (2)."""
-    (rigid,) = ti.static((at.features.rigid,))
+    """Transfer momentum from nodes to rigid bodies (turn 0), or resolve their contact and move them, in parts (1)."""
+    rigid, contact = ti.static((at.features.rigid, phases.device.features.rigid_contact))
     if ti.static(turn == 0):
         rigid.take(at.w, at.run.dt)
     if ti.static(turn == 1):
-        phases.device.features.rigid_contact.resolve(at.w, at.run.dt, at.particles.extent, at.features.colliders)
-    if ti.static(turn == 2):
-        fastest, finite = rigid.move(at.w, at.run.dt)
-        ti.atomic_max(at.step.speed_squared, fastest)
-        if not finite:
-            at.step.broken = 1.0
+        colliders, whole = ti.static((at.features.colliders, at.run.dt))
+        found = contact.look_at_all(at.w, whole, 0, whole, at.particles.extent, colliders)
+        done, parts = 0, 1
+        # Written so that a NaN is no number of parts.
+        if found > 1 and found < MOST_PARTS:
+            parts = ti.cast(ti.ceil(found), int)
+        elif found >= MOST_PARTS:
+            parts = MOST_PARTS
+        part = whole / parts
+        while done < parts:
+            if parts > 1:
+                found = contact.look_at_all(at.w, part, part * done, whole, at.particles.extent, colliders)
+            # What is far from everything moves freely to the end of the step.
+            after = parts
+            if found > FAR:
+                contact.resolve(at.w, part, whole, colliders)
+                after = done + 1
+            fastest, finite = rigid.move(at.w, part * (after - done))
+            done = after
+            ti.atomic_max(at.step.speed_squared, fastest)
+            if not finite:
+                at.step.broken = 1.0
 
 
 @ti.data_oriented
@@ -122,32 +148,50 @@ class RigidContact(Feature):
         return (Phase("move_bodies", "runs", "move", **how, words="move rigid bodies"),)
 
     @ti.func
-    def resolve(self, run: int, dt: ti.f64, extent: ti.template(), colliders: ti.template()):
-        """Change the momenta of the bodies so that no point penetrates a surface in a step of dt seconds."""
-        first = run * self.capacity
-        any_meets = False
+    def look_at_all(
+        self, run: int, dt: ti.f64, gone: ti.f64, whole: ti.f64, extent: ti.template(), colliders: ti.template()
+    ):
+        """Find what points may touch in dt seconds, a part of a step of `whole` seconds, of which `gone` are over.
+
+        Return FAR if no point may, NEXT if none arrives in this time, or in how many parts of it they arrive by little.
+        """
+        found, first = ti.cast(FAR, ti.f64), run * self.capacity
         for q in range(first, first + self.used[run]):
-            any_meets = self.look(run, q, dt, extent, colliders) or any_meets
-        if any_meets:
-            for q in range(first, first + self.used[run]):
-                if self.meets[q] == 1:
-                    self.give(run, q, self.impulse[q])
-            sweep, change, most = 0, ti.cast(1, ti.f64), ti.cast(0, ti.f64)
-            while sweep < SWEEPS and change > ENOUGH * most:
-                change, most = ti.cast(0, ti.f64), ti.cast(0, ti.f64)
-                for q in range(first, first + self.used[run]):
-                    if self.meets[q] == 1:
-                        change = ti.max(change, self.push(run, q, dt, colliders))
-                        most = ti.max(most, self.impulse[q].norm())
-                for j in range(self.bodies.count):
-                    self.bodies.turn_motor(run * self.bodies.count + j, dt)
-                sweep += 1
+            found = ti.max(found, self.look(run, q, dt, gone, whole, extent, colliders))
+        return found
 
     @ti.func
-    def look(self, run: int, q: int, dt: ti.f64, extent: ti.template(), colliders: ti.template()):
-        """Find the obstacle that point q may touch; return whether there is one.
+    def resolve(self, run: int, dt: ti.f64, whole: ti.f64, colliders: ti.template()):
+        """Change the momenta of the bodies so that no point penetrates a surface in dt seconds, see `look_at_all`."""
+        first = run * self.capacity
+        for q in range(first, first + self.used[run]):
+            if self.meets[q] == 1:
+                self.give(run, q, self.impulse[q])
+        sweep, change, most = 0, ti.cast(1, ti.f64), ti.cast(0, ti.f64)
+        while sweep < SWEEPS and change > ENOUGH * most:
+            change, most = ti.cast(0, ti.f64), ti.cast(0, ti.f64)
+            for q in range(first, first + self.used[run]):
+                if self.meets[q] == 1:
+                    change = ti.max(change, self.push(run, q, dt, colliders))
+                    most = ti.max(most, self.impulse[q].norm())
+            for j in range(self.bodies.count):
+                self.bodies.turn_motor(run * self.bodies.count + j, whole)
+            sweep += 1
 
-        If it is that of the previous step, the impulse of that step is the initial value in this step.
+    @ti.func
+    def look(
+        self,
+        run: int,
+        q: int,
+        dt: ti.f64,
+        gone: ti.f64,
+        whole: ti.f64,
+        extent: ti.template(),
+        colliders: ti.template(),
+    ):
+        """Find the obstacle that point q may touch in dt seconds; for the result and the times see `look_at_all`.
+
+        If it is the last one, the last impulse is the initial value.
         """
         d = ti.static(self.dimension)
         b = run * self.bodies.count + self.body[q]
@@ -162,10 +206,10 @@ class RigidContact(Feature):
                 # The point of a ball that faces the obstacle.
                 for a in ti.static(range(d)):
                     arm[a] = -self.ball[b] * normal[a]
-            gap, other, friction, found = self.nearest(run, b, own, arm, extent, colliders)
+            gap, other, friction, way = self.nearest(run, b, own, arm, gone, extent, colliders)
             # Entry by entry: Taichi may lose vectors that are assigned as a whole.
             for a in ti.static(range(d)):
-                normal[a] = found[a]
+                normal[a] = way[a]
         for a in ti.static(range(d)):
             self.arm[q][a] = arm[a]
         self.friction[q] = ti.cast(ti.max(friction, self.rub_of(colliders, run * colliders.capacity + own)), ti.f64)
@@ -177,25 +221,45 @@ class RigidContact(Feature):
         for a in ti.static(range(d)):
             self.normal[q][a], self.impulse[q][a] = normal[a], after[a]
         self.rebound[q] = 0
+        found = ti.cast(FAR, ti.f64)
+        if other != NOTHING:
+            found = NEXT
         if other != NOTHING and pressed == 0:
             bounces = self.restitution[run * colliders.capacity + own]
             if other >= 0:
                 bounces = ti.max(bounces, self.restitution[run * colliders.capacity + other])
             approach = -self.velocity_of(run, q, dt, colliders).dot(normal)
+            if approach * dt > gap:
+                found = ti.max(
+                    1.0, approach * dt / (PART_WAY * colliders.spacing), self.bodies.spin(b) * dt / PART_TURN
+                )
             if bounces > 0 and approach > 0:
-                # It separates at the end of this step or of the next, whichever is closer to the surface. Half of the
-                # velocity change by gravity and forces in the step comes before that, half after.
-                pulled = -0.5 * normal.dot(self.bodies.kick[b])
+                # It separates now or in the next part, whichever is closer to the surface. The velocity is that in the
+                # middle of the step: gravity and forces have changed it since, or will.
+                pull = self.bodies.kick[b]
                 if other >= 0:
                     if self.body_of[other] >= 0:
-                        pulled += 0.5 * normal.dot(self.bodies.kick[run * self.bodies.count + self.body_of[other]])
+                        pull -= self.bodies.kick[run * self.bodies.count + self.body_of[other]]
+                pulled = (gone / whole - 0.5) * normal.dot(pull)
                 parts = ti.max(ti.cast(bounces, ti.f64) * (approach - pulled) - pulled, 0.0)
                 self.rebound[q] = parts if 2 * gap < approach * dt else LATER
-        return other != NOTHING
+        return found
 
     @ti.func
-    def nearest(self, run: int, b: int, own: int, arm: ti.template(), extent: ti.template(), colliders: ti.template()):
-        """Return distance, code, friction and normal of the obstacle nearest to a point, at an arm from body b."""
+    def nearest(
+        self,
+        run: int,
+        b: int,
+        own: int,
+        arm: ti.template(),
+        gone: ti.f64,
+        extent: ti.template(),
+        colliders: ti.template(),
+    ):
+        """Return distance, code, friction and normal of the obstacle nearest to a point, at an arm from body b.
+
+        Obstacles that are not bodies are where they were when the step began, `gone` seconds ago.
+        """
         d = ti.static(self.dimension)
         x, normal = arm, ti.Vector.zero(ti.f64, d)
         for a in ti.static(range(d)):
@@ -210,8 +274,16 @@ class RigidContact(Feature):
                 normal[a] = 1.0 if ti.static(side == 0) else -1.0
         for k in range(colliders.count[run]):
             i = run * colliders.capacity + k
-            if k != own and colliders.wall[i] != HOLD:
+            meets = k != own and colliders.wall[i] != HOLD
+            if self.body_of[k] >= 0:
+                # The point of a ball that faces this body is nearer, and has the right normal.
+                facing = self.ball[run * self.bodies.count + self.body_of[k]] > 0
+                meets = meets and not (facing and self.ball[b] == 0)
+            if meets:
                 place = ti.cast(x, float)
+                if self.body_of[k] < 0:
+                    moved = colliders.velocity[i] + colliders.turning[i] @ (place - colliders.place[i])
+                    place -= ti.cast(gone, float) * moved
                 if colliders.covers(i, place):
                     phi, found = colliders.distance(i, place - colliders.place[i], 0)
                     if ti.cast(phi, ti.f64) < gap:

@@ -132,9 +132,7 @@ class RigidMotion(Feature):
         for j in range(self.count):
             b = run * self.count + j
             i = self.collider_of(run, j)
-            turned = self.turned(b)
-            for a in ti.static(range(d)):
-                self.colliders.place[i][a] = ti.cast(self.pose[b, a], float)
+            self.show_pose(b, i)
             v = ti.Vector.zero(float, d)
             for a in ti.static(range(d)):
                 v[a] = ti.cast(self.rate[b, a], float)
@@ -143,15 +141,22 @@ class RigidMotion(Feature):
             for a in ti.static(range(d)):
                 self.kick[b][a] = ti.cast(push[a], ti.f64)
                 self.momentum[b, a] = self.momentum[b, a] + self.mass[b] * self.kick[b][a]
-                for c in ti.static(range(d)):
-                    self.colliders.turned[i][a, c] = ti.cast(turned[a, c], float)
             self.take_rate(b)
             self.show_rate(b, i, dt)
             self.settled[b] = 0
 
     @ti.func
+    def show_pose(self, b: int, i: int):
+        """Set the position and the rotation of collider i from the pose of body b."""
+        turned = self.turned(b)
+        for a in ti.static(range(self.dimension)):
+            self.colliders.place[i][a] = ti.cast(self.pose[b, a], float)
+            for c in ti.static(range(self.dimension)):
+                self.colliders.turned[i][a, c] = ti.cast(turned[a, c], float)
+
+    @ti.func
     def move(self, run: int, dt: ti.f64):
-        """End a step: move the bodies; return the square of their largest speed, and whether all poses are finite."""
+        """Move the bodies for dt seconds; return their largest squared speed, and whether all poses are finite."""
         d = ti.static(self.dimension)
         fastest, finite = 0.0, True
         for j in range(self.count):
@@ -176,6 +181,7 @@ class RigidMotion(Feature):
                     for c in range(self.loads):
                         own += self.system[b, a, c] * self.rate[b, c]
                     self.momentum[b, a] = own
+            self.show_pose(b, i)
             reached = ti.sqrt(speed) + ti.sqrt(spin) * ti.cast(self.colliders.reach[i][1, 0], ti.f64)
             fastest = ti.max(fastest, ti.cast(reached * reached, float))
             for a in range(self.width):
@@ -411,6 +417,14 @@ class RigidMotion(Feature):
         for a in ti.static(range(self.dimension)):
             result[a] = self.rate[b, a] + turning[a]
         return result
+
+    @ti.func
+    def spin(self, b: int):
+        """Return the angular speed of body b, rad/s."""
+        square = ti.cast(0, ti.f64)
+        for a in ti.static(range(self.dimension, self.loads)):
+            square += self.rate[b, a] ** 2
+        return ti.sqrt(square)
 
     @ti.func
     def hit(self, b: int, impulse: ti.template(), arm: ti.template()):
