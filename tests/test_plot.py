@@ -77,7 +77,7 @@ def test_the_panels_show_the_numbers_of_the_ledger(result):
         assert np.allclose(low[:, 1], 1 - 0.01 * np.arange(6)) and np.allclose(high[:, 1], 1 + 0.02 * np.arange(6))
         (courant,) = series(panels["Courant number"])
         assert np.allclose(courant, [(k * PAUSE, 0.01 * k) for k in range(1, 6)])
-        assert np.allclose(line(panels["Courant number"], "limit 0.5")[:, 1], 0.5)
+        assert np.allclose(line(panels["Courant number"], "limit 1")[:, 1], 1.0)
         assert np.allclose(line(panels["Angular momentum"], "z")[:, 1], 0.3 * np.arange(6))
 
 

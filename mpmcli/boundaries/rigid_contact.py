@@ -5,8 +5,8 @@ points are found by sweeps of projected Gauss-Seidel; they do not pull, and obey
 penetrate a surface in the step ends on it, or separates from it according to the coefficient of restitution. A fraction
 of an existing penetration is removed in each step.
 
-A step in which a point is near a surface has parts, in which bodies move and turn little: points that touch later in
-the step have no share of an earlier impulse.
+A step in which a point arrives at a surface has parts, so that points that touch later have no share of an earlier
+impulse.
 """
 
 import math
@@ -33,8 +33,8 @@ LOOKS = 2
 # Coefficient of friction of sticking surfaces; codes of a wall and of no obstacle in place of the index of a collider.
 STUCK = 1e3
 WALL, NOTHING = -1, -2
-# What `look_at_all` returns.
-FAR, NEXT = 0.0, 0.5
+# Results of `look_at_all` other than a number of parts.
+CLEAR, CLOSE = 0.0, 0.5
 # Rebound of a point that may pass a surface in this step and separates from it in the next.
 LATER = -1.0
 # Turns of the phase that moves bodies: they take the momentum from nodes, and move, while their contact is resolved.
@@ -70,17 +70,15 @@ def move_bodies(phases: ti.template(), at: ti.template(), turn: ti.template()):
         found = contact.look_at_all(at.w, whole, 0, whole, at.particles.extent, colliders)
         done, parts = 0, 1
         # Written so that a NaN is no number of parts.
-        if found > 1 and found < MOST_PARTS:
-            parts = ti.cast(ti.ceil(found), int)
-        elif found >= MOST_PARTS:
-            parts = MOST_PARTS
+        if found > 1:
+            parts = ti.cast(ti.ceil(ti.min(found, MOST_PARTS)), int)
         part = whole / parts
         while done < parts:
             if parts > 1:
                 found = contact.look_at_all(at.w, part, part * done, whole, at.particles.extent, colliders)
             # What is far from everything moves freely to the end of the step.
             after = parts
-            if found > FAR:
+            if found > CLEAR:
                 contact.resolve(at.w, part, whole, colliders)
                 after = done + 1
             fastest, finite = rigid.move(at.w, part * (after - done))
@@ -153,9 +151,9 @@ class RigidContact(Feature):
     ):
         """Find what points may touch in dt seconds, a part of a step of `whole` seconds, of which `gone` are over.
 
-        Return FAR if no point may, NEXT if none arrives in this time, or in how many parts of it they arrive by little.
+        Return CLEAR if there is nothing, CLOSE if no point arrives in time, or in how many parts they should arrive.
         """
-        found, first = ti.cast(FAR, ti.f64), run * self.capacity
+        found, first = ti.cast(CLEAR, ti.f64), run * self.capacity
         for q in range(first, first + self.used[run]):
             found = ti.max(found, self.look(run, q, dt, gone, whole, extent, colliders))
         return found
@@ -221,9 +219,9 @@ class RigidContact(Feature):
         for a in ti.static(range(d)):
             self.normal[q][a], self.impulse[q][a] = normal[a], after[a]
         self.rebound[q] = 0
-        found = ti.cast(FAR, ti.f64)
+        found = ti.cast(CLEAR, ti.f64)
         if other != NOTHING:
-            found = NEXT
+            found = CLOSE
         if other != NOTHING and pressed == 0:
             bounces = self.restitution[run * colliders.capacity + own]
             if other >= 0:
@@ -258,7 +256,7 @@ class RigidContact(Feature):
     ):
         """Return distance, code, friction and normal of the obstacle nearest to a point, at an arm from body b.
 
-        Obstacles that are not bodies are where they were when the step began, `gone` seconds ago.
+        Stored positions of obstacles that are not bodies are those of the beginning of the step, `gone` seconds ago.
         """
         d = ti.static(self.dimension)
         x, normal = arm, ti.Vector.zero(ti.f64, d)

@@ -162,12 +162,10 @@ class RigidMotion(Feature):
         for j in range(self.count):
             b = run * self.count + j
             i = self.collider_of(run, j)
-            speed, spin = ti.cast(0, ti.f64), ti.cast(0, ti.f64)
+            speed, spin = ti.cast(0, ti.f64), self.spin(b)
             for a in ti.static(range(d)):
                 self.pose[b, a] = self.pose[b, a] + dt * self.rate[b, a]
                 speed += self.rate[b, a] ** 2
-            for a in ti.static(range(d, self.loads)):
-                spin += self.rate[b, a] ** 2
             self.turn(b, dt)
             if self.hinged[b] == 1:
                 self.follow(b)
@@ -182,7 +180,7 @@ class RigidMotion(Feature):
                         own += self.system[b, a, c] * self.rate[b, c]
                     self.momentum[b, a] = own
             self.show_pose(b, i)
-            reached = ti.sqrt(speed) + ti.sqrt(spin) * ti.cast(self.colliders.reach[i][1, 0], ti.f64)
+            reached = ti.sqrt(speed) + spin * ti.cast(self.colliders.reach[i][1, 0], ti.f64)
             fastest = ti.max(fastest, ti.cast(reached * reached, float))
             for a in range(self.width):
                 # Written so that a NaN is not finite.

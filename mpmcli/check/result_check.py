@@ -30,7 +30,7 @@ from mpmcli.output.checksums import first_line
 from mpmcli.output.header import RunHeader
 from mpmcli.output.layout import PACKED
 from mpmcli.plain_json import finite_json
-from mpmcli.stability.limits import COURANT, DEFORMATION
+from mpmcli.stability.limits import NODE_COURANT
 
 # Labels of the figures in text.
 TOLD = {
@@ -69,8 +69,6 @@ VOLUME_ERROR, QUARTER = 0.05, 4
 MARGIN = 1.1
 # Smallest accepted ratio of a step to the first one.
 COLLAPSE = 1e-2
-# Cells per step of the fastest node, a cell away from the fastest particle.
-NODES_MOVE = COURANT + DEFORMATION
 # Cells per step above which particles leave all nodes that they act on. Impacts near the speed of sound reach 1.7 in
 # single steps without a gain of energy: it is the speed of a node, which particles rarely reach.
 LEFT_BEHIND = 2.0
@@ -290,9 +288,9 @@ def check_ledger(entries: Sequence[Entry], header: RunHeader, findings: FrameFin
             what += "colliders"
         tell("energy", growth, growth > ENERGY_SUSPECT, growth > ENERGY_WRONG, what, HALVE_STEP)
     courant, forced = of["courant_max"], any(row.limit == "forced" for row in rows)
-    what = f"Before frame {{number}} a node moved {{value:.3g}} cells in a step, {NODES_MOVE:g} is safe"
+    what = f"Before frame {{number}} a node moved {{value:.3g}} cells in a step, {NODE_COURANT:g} is safe"
     fix = 'Set time.step = "auto".' if forced else LOWER_SAFETY
-    tell("courant", courant, courant > NODES_MOVE * MARGIN, courant > LEFT_BEHIND, what, fix)
+    tell("courant", courant, courant > NODE_COURANT * MARGIN, courant > LEFT_BEHIND, what, fix)
     overlap = of.get("contact_overlap", np.zeros(len(rows)))
     what = "Before frame {number} surfaces that met overlapped by {value:.3g} cells"
     tell("overlap", overlap, overlap > OVERLAP, False, what, STIFFER)

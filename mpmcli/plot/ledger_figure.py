@@ -18,7 +18,7 @@ from mpmcli.plain_text import one_line
 from mpmcli.plot.style import THEMES, Theme, ThemeName, drawing, pixels
 from mpmcli.render.frame_choice import evenly_spaced
 from mpmcli.scene.problem import listed
-from mpmcli.stability.limits import COURANT
+from mpmcli.stability.limits import NODE_COURANT
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -327,7 +327,7 @@ def _steps(length: Panel, courant: Panel, history: History) -> None:
     length.logarithmic(shortest, longest)
     courant.title("Courant number", "largest displacement in a step, cells")
     courant.steps(history.columns["courant_max"], 0)
-    courant.level(COURANT, f"limit {COURANT:g}", 1)
+    courant.level(NODE_COURANT, f"limit {NODE_COURANT:g}", 1)
     courant.axes.set_ylim(bottom=0.0)
 
 

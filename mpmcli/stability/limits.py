@@ -13,6 +13,8 @@ from typing import NamedTuple
 COURANT = 0.5
 # Largest velocity gradient times step: keeps det(I + dt C), and with it J, positive (docs/theory.md, 6.4).
 DEFORMATION = 0.5
+# Cells that a node moves in such a step, a cell from the fastest particle.
+NODE_COURANT = COURANT + DEFORMATION
 
 WHY = {
     "wave": "a pressure or shear wave must not cross much more than one cell in a step",

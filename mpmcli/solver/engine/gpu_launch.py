@@ -340,9 +340,9 @@ AGED, MANY = 0.3, 2**19
 # round of this one. Each turn of a later phase is a launch of its own, because drivers may take minutes to compile
 # these phases together with others.
 SHIFT, FIRST, ROUND = range(3)
-# Threads of loops whose number of items only the device knows: enough to fill a large GPU, and elsewhere fewer, because
+# Threads of loops whose number of items only the device knows: on CUDA, to fill a large GPU, and elsewhere, because
 # software Vulkan takes half a microsecond for each.
-WORKERS = {True: 2**17, False: 2**13}
+WORKERS, FEW_WORKERS = 2**17, 2**13
 # Items of phases other than particles, see `Phase`.
 OVER = ("nodes", "planes", "rows", "loads", "runs", "threads")
 
@@ -371,7 +371,8 @@ class GpuLaunch:
         self.phases = GpuPhases(device, layout, doubles=doubles)
         self.shifts = any(phase.shifts for phase in device.phases)
         self.parts = self._parts()
-        self.step_threads = WORKERS[ti.lang.impl.current_cfg().arch == ti.cuda]
+        on_cuda = ti.lang.impl.current_cfg().arch == ti.cuda
+        self.step_threads = WORKERS if on_cuda else FEW_WORKERS
         self.turn_threads = in_blocks(self.runs + self.step_threads)
         self.clear = self.parts[FIRST].pop(0)[0]
         phases = [phase for phase, _ in self.parts[FIRST]]
