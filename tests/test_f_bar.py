@@ -5,6 +5,7 @@ from collections.abc import Callable
 import mpm_reference as reference
 import numpy as np
 import pytest
+from rounding import farthest
 from solver_state import scene_of
 from test_batch import batch_of, outputs_of, same
 
@@ -234,7 +235,8 @@ def test_a_gpu_follows_the_cpu(backend_of: Callable, solids: str) -> None:
     for found in (alone, [frame for frame, _ in batched]):
         assert len(found) == len(expected) == 7
         for frame, other in zip(found, expected, strict=True):
-            assert np.abs(frame.position - other.position).max() < 1e-5
+            apart = farthest(other.position, other.velocity, expected[-1].step, other.time)
+            assert np.abs(frame.position - other.position).max() < apart
             scale = max(np.abs(other.fields["pressure"]).max(), 1.0)
             assert np.abs(frame.fields["pressure"] - other.fields["pressure"]).max() < 5e-3 * scale
 

@@ -3,19 +3,19 @@
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
 from conftest import ROOT
 from solver_state import scene_of
-from test_batch import scene_named
+from test_batch import batch_of, scene_named
 from test_deterministic import on_gpu_path
 
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
 from mpmcli.solver.engine import gpu_launch
-from mpmcli.solver.engine.run import Run, build_run
+from mpmcli.solver.engine.run import Run, build_run, frames_of_all
 from mpmcli.solver.machine.backend import Backend, choose_backend, launcher, start, stop_backend
 from mpmcli.solver.transfer import run_sums
 from mpmcli.solver.transfer.run_sums import WARP, stored_at
@@ -90,43 +90,64 @@ def atomics_of(run: Run, length: int) -> float:
     return (1 + np.count_nonzero(changes)) * 3**d * (d + 1) / len(x)
 
 
-def test_a_step_of_a_liquid_is_five_launches(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture) -> None:
+POOL = scene_of(
+    domain={"size": [1.0, 1.0], "cells": [64, 64]},
+    time={"end": 0.15, "frames": 1},
+    bodies=[
+        {
+            "name": "pool",
+            "material": {"law": "fluid", "density": 1000.0, "bulk_modulus": 1e5},
+            "shape": {"box": {"min": [0.1, 0.1], "max": [0.8, 0.9]}},
+            "velocity": ["-2 * Y", "X"],
+        }
+    ],
+)
+
+
+@pytest.fixture
+def profiled(monkeypatch: pytest.MonkeyPatch) -> Iterator[Backend]:
+    """Give the path of a GPU while Taichi's profiler runs."""
+    stop_backend()
+    monkeypatch.setenv("TI_KERNEL_PROFILER", "1")
+    yield on_gpu_path(start(choose_backend("cpu", 1, "f32", compile_cache=False)))
+    stop_backend()
+
+
+def launches_in(work: Callable[[], object]) -> int:
+    """Return how many launches of steps are in some work."""
+    ti.profiler.clear_kernel_profiler_info()
+    work()
+    records = ti.lang.impl.get_runtime().prog.get_kernel_profiler_records()
+    return sum(record.name.startswith("step_") for record in records)
+
+
+def test_a_step_of_a_liquid_is_five_launches(profiled: Backend, monkeypatch: pytest.MonkeyPatch) -> None:
     """Clear, P2G, walls, nodes and G2P, besides those of the few steps that shift particles.
 
     With 16 particles a thread P2G adds 15 times a particle, for 27, after particles have moved by up to 0.4 cells.
     """
-    stop_backend()
-    monkeypatch.setenv("TI_KERNEL_PROFILER", "1")
     monkeypatch.setattr(run_sums, "SHORTEST", 16)
-    scene = scene_of(
-        domain={"size": [1.0, 1.0], "cells": [64, 64]},
-        time={"end": 1.0, "frames": 1},
-        bodies=[
-            {
-                "name": "pool",
-                "material": {"law": "fluid", "density": 1000.0, "bulk_modulus": 1e5},
-                "shape": {"box": {"min": [0.1, 0.1], "max": [0.8, 0.9]}},
-                "velocity": ["-2 * Y", "X"],
-            }
-        ],
-    )
-    try:
-        backend = start(choose_backend("cpu", 1, "f32", compile_cache=False))
-        run = build_run(scene, on_gpu_path(backend))
-        run.step(1e-4)
-        assert atomics_of(run, 16) < 10
-        moved = 0.0
-        while moved < 0.4:
-            run.step(2e-4)
-            moved += run.courant
-        assert atomics_of(run, 16) < 15
-        ti.profiler.clear_kernel_profiler_info()
+    run = build_run(POOL, profiled)
+    run.step(1e-4)
+    assert atomics_of(run, 16) < 10
+    moved = 0.0
+    while moved < 0.4:
         run.step(2e-4)
-        ti.profiler.print_kernel_profiler_info()
-    finally:
-        stop_backend()
-    launches = [line.split()[-1] for line in capfd.readouterr().out.splitlines() if "_kernel_" in line]
-    assert len([name for name in launches if name.startswith("step_")]) == 5
+        moved += run.courant
+    assert atomics_of(run, 16) < 15
+    assert launches_in(lambda: run.step(2e-4)) == 5
+
+
+def test_launches_do_not_grow_with_the_runs(profiled: Backend) -> None:
+    """Seven runs take as many as one."""
+    launches = {}
+    for count in (1, 7):
+        batch = batch_of([POOL] * count, profiled)
+        runs = {slot: Run(batch, slot, POOL) for slot in range(count)}
+        launches[count] = launches_in(lambda runs=runs: list(frames_of_all(runs)))
+        assert runs[count - 1].step_count > 100
+    assert launches[1] < 8 * runs[0].step_count
+    assert launches[7] == launches[1]
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ import numpy as np
 import path_run
 import pytest
 from path_reference import Arrays, check_nodes, reference_groups
+from rounding import OF_A_STEP
 
 from mpmcli.errors import InputError
 from mpmcli.scene import Scene
@@ -16,7 +17,7 @@ from mpmcli.solver.machine.backend import Backend
 from mpmcli.solver.transfer.splines import PAD
 
 # As in test_solver_paths.
-TOLERANCE = {"f32": 1e-6, "f64": 1e-12}
+TOLERANCE = {"f32": OF_A_STEP, "f64": 1e-12}
 CUBIC = {"kernel": "cubic"}
 AFLIP = {"transfer": "aflip", "flip": 0.9}
 

@@ -15,6 +15,7 @@ import path_run
 import pytest
 from conftest import GPU, PythonRun
 from path_reference import Arrays, check_nodes, reference_groups
+from rounding import OF_A_STEP
 
 from mpmcli.scene import Scene, sample_bodies
 from mpmcli.solver.transfer.splines import PAD
@@ -23,9 +24,8 @@ CPU_THREADS = (1, 3)
 PATHS = [("cpu", threads) for threads in CPU_THREADS] + [(GPU, 1)]
 # In 3D one path is enough: the threads share the work as in 2D, where the same atomics add, too.
 SLOW = {(GPU, 1, 3), ("cpu", 1, 3)}
-# Round-off of a step relative to the largest value of each array: sums of some ten terms, and products of
-# about ten factors.
-TOLERANCE = {"f32": 1e-6, "f64": 1e-12}
+# Round-off of a step relative to the largest value of each array.
+TOLERANCE = {"f32": OF_A_STEP, "f64": 1e-12}
 
 
 @pytest.fixture(scope="module")

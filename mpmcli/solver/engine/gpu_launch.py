@@ -340,9 +340,9 @@ AGED, MANY = 0.3, 2**19
 # round of this one. Each turn of a later phase is a launch of its own, because drivers may take minutes to compile
 # these phases together with others.
 SHIFT, FIRST, ROUND = range(3)
-# Threads of loops whose number of items only the device knows: on CUDA, to fill a large GPU, and elsewhere, because
-# software Vulkan takes half a microsecond for each.
-WORKERS, FEW_WORKERS = 2**17, 2**13
+# Most threads of loops whose number of items only the device knows, and nodes of a thread in a small domain: on CUDA to
+# fill a large GPU, and elsewhere because software Vulkan takes half a microsecond for each thread.
+WORKERS, FEW_WORKERS = (2**17, 1), (2**13, 16)
 # Items of phases other than particles, see `Phase`.
 OVER = ("nodes", "planes", "rows", "loads", "runs", "threads")
 
@@ -372,7 +372,8 @@ class GpuLaunch:
         self.shifts = any(phase.shifts for phase in device.phases)
         self.parts = self._parts()
         on_cuda = ti.lang.impl.current_cfg().arch == ti.cuda
-        self.step_threads = WORKERS if on_cuda else FEW_WORKERS
+        threads, nodes = WORKERS if on_cuda else FEW_WORKERS
+        self.step_threads = in_blocks(min(threads, self.runs * device.grid.node_count // nodes))
         self.turn_threads = in_blocks(self.runs + self.step_threads)
         self.clear = self.parts[FIRST].pop(0)[0]
         phases = [phase for phase, _ in self.parts[FIRST]]
