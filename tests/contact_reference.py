@@ -10,7 +10,7 @@ from mpm_reference import MARGIN, Box, quadratic
 
 @dataclass(frozen=True)
 class Surface:
-    """What the particles of a body show: places x, normals n (n, d) and depths (n) of the deformed surface.
+    """What the particles of a body show: places x, normals n and ways to the surface (n, d), and depths at rest (n).
 
     slope: dv/dn, (n, d), 1/s; distance: of its particles at rest, m; modulus: its P-wave modulus, Pa; density: at rest,
     kg/m^3.
@@ -18,6 +18,7 @@ class Surface:
 
     x: np.ndarray
     n: np.ndarray
+    way: np.ndarray
     depth: np.ndarray
     slope: np.ndarray
     distance: float
@@ -30,7 +31,8 @@ class Surface:
         normal = np.stack([np.linalg.inv(f).T @ each for f, each in zip(F, N, strict=True)])
         size = np.linalg.norm(normal, axis=1)
         normal /= size[:, None]
-        return Surface(x, normal, D / size, np.einsum("pij,pj->pi", C, normal), *numbers)
+        way = D[:, None] * np.einsum("pij,pj->pi", F, N)
+        return Surface(x, normal, way, D, np.einsum("pij,pj->pi", C, normal), *numbers)
 
 
 def unit(v: np.ndarray) -> np.ndarray:
@@ -47,7 +49,7 @@ def near(surface: Surface, node: np.ndarray, h: float) -> np.ndarray:
 def points_of(surface: Surface, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the points and the normals that a surface shows at a node, (n, d)."""
     shown = weights > 0
-    return (surface.x + surface.depth[:, None] * surface.n)[shown], surface.n[shown]
+    return (surface.x + surface.way)[shown], surface.n[shown]
 
 
 def soft_minimum(

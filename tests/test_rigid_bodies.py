@@ -123,7 +123,6 @@ def test_what_cannot_move_freely_is_one_sentence(given: dict, said: str) -> None
     [
         ({"domain": {"walls": {"x_min": "periodic", "x_max": "periodic"}}}, "in a domain with periodic walls"),
         ({"domain": {"walls": "stick", "wall_velocity": {"y_min": [1.0, 0.0]}}}, "with moving walls"),
-        ({"contact": {"default": "separate"}}, "with separating bodies"),
     ],
 )
 def test_what_they_are_not_available_with_is_refused(tables: dict, reason: str) -> None:
@@ -140,7 +139,6 @@ def test_all_that_a_scene_cannot_combine_is_said_at_once() -> None:
         make_plan(asked, Backend("vulkan", 1, "f32", False))
     assert [line.split(" are not available ")[0] for line in str(raised.value).splitlines()] == [
         "separating bodies",
-        "colliders with a density",
         "colliders with a density",
         "sparse grids",
     ]

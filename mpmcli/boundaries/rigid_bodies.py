@@ -159,35 +159,48 @@ class RigidBodies(RigidMotion):
 
     @ti.func
     def take(self, run: int, dt: ti.f64):
-        """Add the impulses that the nodes lost to the momenta of the bodies."""
+        """Add the impulses that the nodes lost to the momenta of the bodies, and those of their motors."""
         for j in range(self.count):
             b = run * self.count + j
-            i = self.collider_of(run, j)
             for a in ti.static(range(self.loads)):
                 self.support[b, a] = ti.cast(0, ti.f64)
-            low, rows = self.rows_near(i)
-            push = ti.Vector.zero(ti.f64, self.dimension)
-            for q in range(self.product(rows)):
-                row = (
-                    run * self.colliders.loads.rows + self.row_at(low, rows, q)
-                ) * self.colliders.capacity + self.numbers[j]
-                for a in ti.static(range(self.loads)):
-                    self.booked[b, a] = self.booked[b, a] + self.colliders.loads.taken[row][a]
-                    self.momentum[b, a] = self.momentum[b, a] + self.colliders.loads.taken[row][a]
-                    if ti.static(a < self.dimension):
-                        push[a] += self.colliders.loads.taken[row][a]
-                    self.colliders.loads.taken[row][a] = 0.0
-            if self.hinged[b] == 1:
-                # The torque about the hinge, which is that about the centre and this one.
-                arm = ti.Vector.zero(ti.f64, self.dimension)
-                for a in ti.static(range(self.dimension)):
-                    arm[a] = self.pose[b, a] - self.hinge[b][0, a]
-                load = self.load_of(push, arm)
-                for a in ti.static(range(self.dimension, self.loads)):
-                    self.booked[b, a] = self.booked[b, a] + load[a]
-            self.take_rate(b)
+            self.absorb(run, j)
             self.drive[b] = 0
             self.turn_motor(b, dt)
+
+    @ti.func
+    def absorb_all(self, run: int, dt: ti.f64):
+        """Add the impulses that the nodes lost so far to the momenta of the bodies; a step may bring more."""
+        for j in range(self.count):
+            b = run * self.count + j
+            self.absorb(run, j)
+            self.show_rate(b, self.collider_of(run, j), dt)
+            self.settled[b] = 0
+
+    @ti.func
+    def absorb(self, run: int, j: int):
+        """Add the impulses that the nodes lost to the momentum of the j-th body, and forget them."""
+        b, i = run * self.count + j, self.collider_of(run, j)
+        low, rows = self.rows_near(i)
+        push = ti.Vector.zero(ti.f64, self.dimension)
+        for q in range(self.product(rows)):
+            row = (run * self.colliders.loads.rows + self.row_at(low, rows, q)) * self.colliders.capacity
+            row += self.numbers[j]
+            for a in ti.static(range(self.loads)):
+                self.booked[b, a] = self.booked[b, a] + self.colliders.loads.taken[row][a]
+                self.momentum[b, a] = self.momentum[b, a] + self.colliders.loads.taken[row][a]
+                if ti.static(a < self.dimension):
+                    push[a] += self.colliders.loads.taken[row][a]
+                self.colliders.loads.taken[row][a] = 0.0
+        if self.hinged[b] == 1:
+            # The torque about the hinge, which is that about the centre and this one.
+            arm = ti.Vector.zero(ti.f64, self.dimension)
+            for a in ti.static(range(self.dimension)):
+                arm[a] = self.pose[b, a] - self.hinge[b][0, a]
+            load = self.load_of(push, arm)
+            for a in ti.static(range(self.dimension, self.loads)):
+                self.booked[b, a] = self.booked[b, a] + load[a]
+        self.take_rate(b)
 
     # Rows of nodes in reach.
 

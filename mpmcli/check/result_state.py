@@ -12,6 +12,7 @@ from mpmcli.frames.ledger import LedgerRow
 from mpmcli.materials.registry import laws
 from mpmcli.output.header import BodyHeader, RunHeader, nearest_image
 from mpmcli.plain_text import counted
+from mpmcli.stability.limits import OVERLAP
 
 # No law is valid for J below the first. Coherent material would have torn for J above the second.
 CRUSHED, BLOWN_UP = 0.1, 10.0
@@ -92,7 +93,8 @@ class StateCheck(FrameCheck):
         if (lowest > header.origin).all() and (highest < header.upper).all():
             return
         out = np.fmax(header.origin - frame.position, frame.position - header.upper)
-        held = int(((out >= 0) & ~header.periodic).any(1).sum())
+        error = 4 * header.place_error(frame.position.dtype)
+        held = int(((out >= 0) & (out <= error) & ~header.periodic).any(1).sum())
         opened = any(header.open_axes)
         if frame.index > 0 and not opened and held > HELD * len(out):
             what = f"In frame {frame.index} {held} of {counted(len(out), 'particle')} lie on a wall"
@@ -101,7 +103,10 @@ class StateCheck(FrameCheck):
             self._findings.add("note", "held-positions", frame.index, what, fix, value=held / len(out))
         # At an open face particles stay outside until the next sort.
         late = 2 * header.spacing * np.array(header.open_axes) if opened else 0.0
-        far = (out > 4 * header.place_error(frame.position.dtype) + late) & np.isfinite(out)
+        # Solids that meet walls at their surfaces overlap them.
+        solid = np.array([law.coherent and law.deformation == "F" for law in header.laws], bool)
+        deep = OVERLAP * (header.spacing or 0.0) * solid[frame.material][:, None] if solid.any() else 0.0
+        far = (out > error + late + deep) & np.isfinite(out)
         beyond = np.where(far, out, 0.0).max(1)
         if beyond.any():
             p, escaped = int(beyond.argmax()), counted(np.count_nonzero(beyond), "particle")

@@ -112,13 +112,9 @@ def _sticking(facts: SceneFacts) -> Iterator[Finding]:
         fix = "Change this to resolve contact at their surfaces."
         yield Finding("note", "contact", what, fix, len(elastic), elastic[0])
         return
-    domain, d = scene.domain, scene.dimension
-    faces = zip(domain.walls.faces(d), domain.frictions, strict=True)
-    rough = any(word in SEPARATING and mu > 0 for words, own in faces for word, mu in zip(words, own, strict=True))
-    rough = rough or any(one.wall == "separate" and one.friction > 0 for one in scene.colliders)
-    if rough and not scene.one_field:
-        what = f'Body "{elastic[0]}" is alone, so that it does not meet walls and colliders at its surface, nor rolls.'
-        fix = 'Set contact.default = "separate" if it slides or rolls on them.'
+    if scene.one_field and scene.has_obstacles:
+        what = f'With {scene.one_field} body "{elastic[0]}" meets walls and colliders on the grid, and does not roll.'
+        fix = "Change this to resolve contact at its surface."
         yield Finding("note", "contact", what, fix, 1, elastic[0])
 
 

@@ -148,8 +148,8 @@ class Contact(Table):
         description='"separate": each elastic body has a velocity field of its own; they meet each other, all other '
         "material, and walls and colliders that separate, where their surfaces are, slide with friction, and part. "
         'Liquids, grains and bodies that yield stick to each other. "stick": bodies share one velocity field, meet up '
-        'to two cells before they touch, and do not slide. "auto": "separate" with an elastic body among others, '
-        'unless settings of the solver or rigid bodies exclude it; otherwise "stick".',
+        'to two cells before they touch, and do not slide. "auto": "separate" with an elastic body that can meet '
+        'anything, unless settings of the solver exclude it; otherwise "stick".',
     )
     friction: NotNegative | None = Field(
         None,

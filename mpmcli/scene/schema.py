@@ -15,7 +15,7 @@ from pydantic import (
 )
 
 from mpmcli.scene.colliders import Collider
-from mpmcli.scene.domain import Domain
+from mpmcli.scene.domain import SEPARATING, Domain
 from mpmcli.scene.entry import ConstantTable, OfTime, StartDeformation, StartMatrix, StartVector
 from mpmcli.scene.forces import Contact, Force, Impulse
 from mpmcli.scene.material import MaterialParameters
@@ -395,7 +395,13 @@ class Scene(Table):
         if self.contact.default != "auto":
             return self.contact.default == "separate"
         elastic = any(source.has_surface for source in self.sources)
-        return elastic and len(self.sources) > 1 and not self.one_field
+        return elastic and (len(self.sources) > 1 or self.has_obstacles) and not self.one_field
+
+    @property
+    def has_obstacles(self) -> bool:
+        """Whether there is a wall or a collider that separates."""
+        faces = self.domain.walls.faces(self.dimension)
+        return any(SEPARATING & {*pair} for pair in faces) or any(one.wall == "separate" for one in self.colliders)
 
     @property
     def one_field(self) -> str:
@@ -405,8 +411,6 @@ class Scene(Table):
         found = {
             'solver.solids = "total"': solver.solids == "total",
             'solver.grid = "sparse"': solver.grid == "sparse",
-            "solver.deterministic = true": solver.deterministic,
-            "rigid bodies": any(collider.free for collider in self.colliders),
             "so many bodies": fields > MOST_FIELDS or fields * math.prod(self.domain.cells) > MOST_NODES,
         }
         return next((setting for setting, given in found.items() if given), "")

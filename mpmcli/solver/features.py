@@ -61,7 +61,8 @@ class Features:
             self.rigid = RigidBodies(self.colliders, RigidDrive(d, kind.drives, values.device), runs)
             self.rigid_contact = RigidContact(self.rigid, kind.faces, runs)
         if kind.layers.separate:
-            self.contact = BodyContact(groups, orders, grid, kind.layers, runs, backend.threads, on_cpu=on_cpu)
+            how = {"on_cpu": on_cpu, "couples": bool(kind.colliders.free)}
+            self.contact = BodyContact(groups, orders, grid, kind.layers, runs, backend.threads, **how)
         if kind.by_points:
             self.colliders.support = grid.scheme.spline.nodes / 2
             fills = any(law.relaxes for law in kind.members)

@@ -15,6 +15,8 @@ COURANT = 0.5
 DEFORMATION = 0.5
 # Cells that a node moves in such a step, a cell from the fastest particle.
 NODE_COURANT = COURANT + DEFORMATION
+# Cells by which particles of bodies that meet walls at their surfaces may be beyond a wall.
+OVERLAP = 0.5
 
 WHY = {
     "wave": "a pressure or shear wave must not cross much more than one cell in a step",

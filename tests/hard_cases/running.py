@@ -111,6 +111,11 @@ def run(run: Run) -> Record:
     return Record(frames, rows, fine, stopped)
 
 
+def with_springs(rows: Sequence[LedgerRow]) -> np.ndarray:
+    """Return the energy of rows, J, with that of the springs of contact, which is not in the sum."""
+    return np.array([row.energy for row in rows]) - np.cumsum([row.contact_work or 0.0 for row in rows])
+
+
 def growth(energy: np.ndarray) -> float:
     """Return the largest rise of an energy above what it was at any time before."""
     return float((energy - np.minimum.accumulate(energy)).max())

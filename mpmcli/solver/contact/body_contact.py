@@ -101,7 +101,9 @@ class BodyContact(Feature):
         threads: int,
         *,
         on_cpu: bool,
+        couples: bool,
     ) -> None:
+        self.couples = couples
         self.surfaces = BodySurfaces(groups, orders, grid, layers, runs, on_cpu=on_cpu)
         self.dimension, self.layers, self.node_count = grid.dimension, layers.count, grid.node_count
         self.capacity = points_near(grid.scheme.spline.nodes, layers, grid.dimension)
@@ -134,7 +136,7 @@ class BodyContact(Feature):
         self._rows.write(run * self.layers, np.hstack([rows, layers.frictions(scene)]), bands)
 
     def phases(self, *, serial: bool) -> tuple[Phase, ...]:
-        return contact_phases(self.surfaces.groups, serial=serial)
+        return contact_phases(self.surfaces.groups, serial=serial, couples=self.couples)
 
     @ti.func
     def begin_step(self, phases: ti.template(), run: ti.template(), _step: ti.template()):
@@ -175,26 +177,32 @@ class BodyContact(Feature):
             self.extremes[run, k] = 0.0
 
     @ti.func
-    def exchange_all(self, at: ti.template()):
-        """Exchange momentum between bodies, and then with obstacles, at a node; `at` is a `ContactNode`."""
+    def exchange_all(self, at: ti.template(), weighs: ti.template()):
+        """Exchange momentum between bodies, and then with obstacles, at a node; `at` is a `ContactNode`.
+
+        If it `weighs`, add only to the sums of rigid bodies what they would take.
+        """
         place = self.surfaces.place_of(at.grid, at.w, at.index)
         present = self.surfaces.present[place]
         # Layers in descending order: first all pairs of layers, then each layer with the obstacles, numbered after the
         # layers.
-        for turn in range(ti.select(self.surfaces.met[place] > 1, 2, 1)):
+        for turn in range(ti.static(int(weighs or self.pairs == 0)), ti.select(self.surfaces.met[place] > 1, 2, 1)):
             rest = present
             while rest > 255 or (turn == 1 and rest > ti.static(int(self.surfaces.shares))):
                 c, others, o = ti.cast(rest & 255, int) - 1, rest >> 8, 0
                 while (turn == 0 and others > 0) or (turn == 1 and o < at.obstacles.count()):
                     a = ti.select(turn == 0, ti.cast(others & 255, int) - 1, c)
-                    met = ti.select(turn == 0, c, self.layers + o)
-                    self.exchange(at, a, met)
+                    met, acts = ti.select(turn == 0, c, self.layers + o), True
+                    if ti.static(weighs):
+                        acts = at.rigid_of(o) >= 0
+                    if acts:
+                        self.exchange(at, a, met, weighs)
                     others, o = others >> 8, o + 1
                 rest = rest >> 8
 
     @ti.func
-    def exchange(self, at: ti.template(), a: int, c: int):
-        """Exchange momentum of layer a with layer c, or obstacle c - layers, at a node."""
+    def exchange(self, at: ti.template(), a: int, c: int, weighs: ti.template()):
+        """Exchange momentum of layer a with layer c, or obstacle c - layers, at a node; see `exchange_all`."""
         grid, obstacles, h, d = ti.static((at.grid, at.obstacles, at.grid.spacing, self.dimension))
         w, node, row = ti.static((at.w, at.node, at.w * self.layers))
         at_a, at_c = at.index + a * ti.static(self.node_count), at.index + c * ti.static(self.node_count)
@@ -204,14 +212,15 @@ class BodyContact(Feature):
         # The sum of the inverse moduli of both.
         soft = 1.0 / self.rows[row + a, MODULUS]
         u, J, facing = ti.Vector.zero(float, d), ti.Vector.zero(float, d), ti.Vector.zero(float, d)
-        if bodies:
-            of_c = self.surfaces.total(grid, node, at.index, c * ti.static(self.node_count))
-            m_c = of_c[d]
-            # Evaluated in this order, because the product of two masses may be too small for single precision.
-            reduced, friction = m_a * (m_c / (m_a + m_c)), self.rows[row + a, FRICTION + c]
-            soft += 1.0 / self.rows[row + c, MODULUS]
-            for b in ti.static(range(d)):
-                u[b] = of_c[b] / m_c - of_a[b] / m_a
+        if ti.static(self.pairs > 0):
+            if bodies:
+                of_c = self.surfaces.total(grid, node, at.index, c * ti.static(self.node_count))
+                m_c = of_c[d]
+                # Evaluated in this order, because the product of two masses may be too small for single precision.
+                reduced, friction = m_a * (m_c / (m_a + m_c)), self.rows[row + a, FRICTION + c]
+                soft += 1.0 / self.rows[row + c, MODULUS]
+                for b in ti.static(range(d)):
+                    u[b] = of_c[b] / m_c - of_a[b] / m_a
         if ti.static(obstacles.any):
             if not bodies:
                 distance, normal, velocity, rough = obstacles.at(c - self.layers, place_of(node, h), REACH)
@@ -219,39 +228,49 @@ class BodyContact(Feature):
                 for b in ti.static(range(d)):
                     facing[b] = normal[b]
                     u[b] = velocity[b] - at.gravity_step[b] - of_a[b] / m_a
+        if ti.static(self.surfaces.shares):
+            if bodies and a == 0 and friction >= 0.0:
+                change = stopped(self, at, c, u, friction)
+                for b in ti.static(range(d)):
+                    J[b] = reduced * change[b]
+                self.loads.add(w, node, ti.static(self.pairs), 0, reduced * change.dot(u + change))
         if friction < 0.0:
             for b in ti.static(range(d)):
                 J[b] = -reduced * u[b]
-        elif bodies and a < ti.static(int(self.surfaces.shares)):
-            change = stopped(self, at, c, u, friction)
-            for b in ti.static(range(d)):
-                J[b] = reduced * change[b]
-            self.loads.add(w, node, ti.static(self.pairs), 0, reduced * change.dot(u + change))
-        elif bodies or way < REACH * h:
+        elif (bodies and a >= ti.static(int(self.surfaces.shares))) or way < REACH * h:
             stiffness = 2.0 / soft * at.step.dt**2
             gap, n, aside, kappa, deepest = self.separation(at, a, c, way, facing, reduced, stiffness)
             if kappa >= 0.0:
                 spring, implicit = gap / h, IMPLICIT_OBSTACLES
                 if bodies:
                     spring, implicit = ti.max(spring, -DEEPEST), IMPLICIT
-                pushed = self.impulse(gap / h, spring, u, n, aside, kappa, implicit, reduced, h / at.step.dt, friction)
+                elif ti.static(self.couples):
+                    # What arrives at an overlap of up to a step leaves no faster than it came.
+                    implicit = ti.max(implicit, 1.0 - 2.0 / ti.max(at.swing(c - self.layers, stiffness), SMALLEST))
+                pushed, yields, holds = self.impulse(
+                    gap / h, spring, u, n, aside, kappa, implicit, reduced, h / at.step.dt, friction
+                )
                 for b in ti.static(range(d)):
                     J[b] = pushed[b]
-                self.loads.add(w, node, ti.static(self.pairs), 0, pushed.dot(u + pushed / reduced))
-                if pushed.dot(n) > 0.0:
+                if ti.static(weighs):
+                    at.weigh(c - self.layers, pushed, n, yields, ti.select(holds, reduced, 0.0))
+                else:
+                    self.loads.add(w, node, ti.static(self.pairs), 0, pushed.dot(u + pushed / reduced))
+                if ti.static(not weighs) and pushed.dot(n) > 0.0:
                     for k, reached in ti.static(enumerate((deepest / h, gap / h))):
                         # Most values are not extremes, and atomic operations are slow.
                         if reached > self.extremes[w, k]:
                             ti.atomic_max(self.extremes[w, k], reached)
-        for b in ti.static(range(d)):
-            grid.nodes[at_a][b] -= J[b]
-            if bodies:
-                grid.nodes[at_c][b] += J[b]
-        if ti.abs(J).max() > 0.0:
-            if bodies:
-                self.loads.take(w, node, ti.raw_div(c * (c - 1), 2) + a, -J, place_of(node, h))
-            elif ti.static(obstacles.any):
-                obstacles.take(c - self.layers, node, place_of(node, h), J)
+        if ti.static(not weighs):
+            for b in ti.static(range(d)):
+                grid.nodes[at_a][b] -= J[b]
+                if bodies:
+                    grid.nodes[at_c][b] += J[b]
+            if ti.abs(J).max() > 0.0:
+                if bodies:
+                    self.loads.take(w, node, ti.raw_div(c * (c - 1), 2) + a, -J, place_of(node, h))
+                elif ti.static(obstacles.any):
+                    obstacles.take(c - self.layers, node, place_of(node, h), J)
 
     @ti.func
     def impulse(
@@ -267,7 +286,7 @@ class BodyContact(Feature):
         speed: float,
         friction: float,
     ):
-        """Return the impulse from a to c at a node, N s.
+        """Return the impulse from a to c at a node, N s, its decrease with the velocity of c, and whether they stick.
 
         Args:
             gap: gap, cells.
@@ -280,16 +299,18 @@ class BodyContact(Feature):
             speed: speed of one cell per step, m/s.
             friction: coefficient of friction.
         """
-        away = u.dot(n)
-        push = ti.max(0.0, -implicit * away - spring * speed) * kappa / (1.0 + implicit * kappa)
+        away, share = u.dot(n), kappa / (1.0 + implicit * kappa)
+        push = ti.max(0.0, -implicit * away - spring * speed) * share
         # Approach that is too fast for the spring is stopped.
-        push = reduced * ti.max(push, -away * ti.min(ti.max((-gap - STOPS[0]) / (STOPS[1] - STOPS[0]), 0.0), 1.0))
+        stops = ti.min(ti.max((-gap - STOPS[0]) / (STOPS[1] - STOPS[0]), 0.0), 1.0)
+        yields = reduced * ti.select(-away * stops > push, stops, ti.select(push > 0.0, implicit * share, 0.0))
+        push = reduced * ti.max(push, -away * stops)
         along = u + aside
         along -= along.dot(n) * n
         slip, rub = along.norm(), 0.0
         if slip > 0.0:
             rub = ti.min(friction * push, reduced * slip) / slip
-        return push * n - rub * along
+        return push * n - rub * along, yields, friction * push > 0.0 and friction * push >= reduced * slip
 
     @ti.func
     def separation(
@@ -333,47 +354,74 @@ class BodyContact(Feature):
                     far[0], deepest, kappa = off, most, stiffness / h * area / reduced
                 for b in ti.static(range(d)):
                     normal[b] = axis[b]
-        if c < self.layers and counts.min() > 0 and n_a.dot(n_c) < ALIKE:
-            # The faces of the bodies that look at each other. Mean normals tilt beside edges.
-            faces, alike, middle = ti.Matrix.zero(float, 2, d), 0.0, 0.0
-            for side in range(2):
-                stay_rolled(self.points, at.thread + side)
-                towards = ti.select(side == 0, -n_c, n_a)
-                met = self.normal_along((2 * at.thread + side) * self.stride, counts[side], towards)
+        if ti.static(self.pairs > 0):
+            if c < self.layers and counts.min() > 0 and n_a.dot(n_c) < ALIKE:
+                gap, axis, kappa, deepest = self.apart(at, a, c, n_a, n_c, counts, reduced, stiffness, far)
                 for b in ti.static(range(d)):
-                    faces[side, b] = met[b]
-                    alike += faces[0, b] * faces[1, b]
-            for b in ti.static(range(d)):
-                normal[b] = faces[0, b] + faces[1, b]
-            normal, meet = normal.normalized(SMALLEST), alike > MEET
-            if alike < SAME:
-                found, axis, off = self.between(at.thread, counts, row + a, row + c)
-                # Without any point that faces the other body the axis is zero: faces that hardly look at each other.
-                if axis.norm_sqr() > 0.5:
-                    gap, middle, meet, kappa = found, off, False, 1.0
-                    for b in ti.static(range(d)):
-                        normal[b] = axis[b]
-            if meet:
-                for side in range(2):
-                    stay_rolled(self.points, at.thread + side)
-                    far[side] = self.distance_along(at, side, counts[side], row + ti.select(side == 0, a, c), normal)
-                gap, middle, kappa = far[0] + far[1], 0.5 * (far[0] - far[1]), 1.0
-            if kappa > 0.0:
-                far[0], far[1] = 0.5 * gap + middle, 0.5 * gap - middle
-                # Mass of such a node at flat faces. Nodes with less mass, which are at edges, push less.
-                light = 0.0
-                for side in range(2):
-                    density = self.rows[row + ti.select(side == 0, a, c), DENSITY]
-                    light += 1.0 / (density * filled(far[side] * at.grid.inverse_spacing))
-                mass = ti.max(reduced, h**d / light)
-                kappa = stiffness * h ** ti.static(d - 2) * traction(middle * at.grid.inverse_spacing) / mass
-                # Nodes with very little mass, beside edges, do not represent a surface.
-                deepest = ti.select(reduced > LIGHT * mass, -gap, 0.0)
+                    normal[b] = axis[b]
         # Change of velocity from the node to the surface of each body, along its normal.
         aside = ti.Vector.zero(float, d)
         for b in ti.static(range(d)):
             aside[b] = far[0] * slopes[0, b] - far[1] * slopes[1, b]
         return gap, normal, aside, kappa, deepest
+
+    @ti.func
+    def apart(
+        self,
+        at: ti.template(),
+        a: int,
+        c: int,
+        n_a: ti.template(),
+        n_c: ti.template(),
+        counts: ti.template(),
+        reduced: float,
+        stiffness: float,
+        far: ti.template(),
+    ):
+        """Return gap, normal, kappa and the deepest overlap of two bodies that face each other, see `separation`.
+
+        Args:
+            n_a, n_c, counts: see `collect`.
+            far: distances of the node from their surfaces, m, which are set.
+        """
+        h, d, row = ti.static((at.grid.spacing, self.dimension, at.w * self.layers))
+        gap, normal, kappa, deepest = 0.0, ti.Vector.zero(float, d), -1.0, 0.0
+        # The faces of the bodies that look at each other. Mean normals tilt beside edges.
+        faces, alike, middle = ti.Matrix.zero(float, 2, d), 0.0, 0.0
+        for side in range(2):
+            stay_rolled(self.points, at.thread + side)
+            towards = ti.select(side == 0, -n_c, n_a)
+            met = self.normal_along((2 * at.thread + side) * self.stride, counts[side], towards)
+            for b in ti.static(range(d)):
+                faces[side, b] = met[b]
+                alike += faces[0, b] * faces[1, b]
+        for b in ti.static(range(d)):
+            normal[b] = faces[0, b] + faces[1, b]
+        normal, meet = normal.normalized(SMALLEST), alike > MEET
+        if alike < SAME:
+            found, axis, off = self.between(at.thread, counts, row + a, row + c)
+            # Without any point that faces the other body the axis is zero: faces that hardly look at each other.
+            if axis.norm_sqr() > 0.5:
+                gap, middle, meet, kappa = found, off, False, 1.0
+                for b in ti.static(range(d)):
+                    normal[b] = axis[b]
+        if meet:
+            for side in range(2):
+                stay_rolled(self.points, at.thread + side)
+                far[side] = self.distance_along(at, side, counts[side], row + ti.select(side == 0, a, c), normal)
+            gap, middle, kappa = far[0] + far[1], 0.5 * (far[0] - far[1]), 1.0
+        if kappa > 0.0:
+            far[0], far[1] = 0.5 * gap + middle, 0.5 * gap - middle
+            # Mass of such a node at flat faces. Nodes with less mass, which are at edges, push less.
+            light = 0.0
+            for side in range(2):
+                density = self.rows[row + ti.select(side == 0, a, c), DENSITY]
+                light += 1.0 / (density * filled(far[side] * at.grid.inverse_spacing))
+            mass = ti.max(reduced, h**d / light)
+            kappa = stiffness * h ** ti.static(d - 2) * traction(middle * at.grid.inverse_spacing) / mass
+            # Nodes with very little mass, beside edges, do not represent a surface.
+            deepest = ti.select(reduced > LIGHT * mass, -gap, 0.0)
+        return gap, normal, kappa, deepest
 
     @ti.func
     def springs(self, at: ti.template(), count: int, o: int, row: int, way_there: float, facing_there: ti.template()):
@@ -389,9 +437,9 @@ class BodyContact(Feature):
         obstacles, h, d = ti.static((at.obstacles, at.grid.spacing, self.dimension))
         x, first, area, deepest, weights = place_of(at.node, h), 2 * at.thread * self.stride, 0.0, 0.0, 0.0
         force, mean = ti.Vector.zero(float, d), ti.Vector.zero(float, d)
-        # Whether the obstacle is plane here, which saves most evaluations of its distance.
+        # Whether the obstacle is plane here, as walls are, which saves most evaluations of its distance.
         plane, place = True, ti.Vector.zero(float, d)
-        for k in range(2 * (d - 1)):
+        for k in range(ti.select(o < ti.static(len(obstacles.faces)), 0, 2 * (d - 1))):
             if plane:
                 place = x - way_there * facing_there
                 place += ti.select(k % 2 == 0, ASIDE, -ASIDE) * h * tangent(facing_there, ti.raw_div(k, 2))
@@ -526,26 +574,31 @@ class BodyContact(Feature):
                                         way[b] = ti.cast(there[b] - PAD, float) * h - self.surfaces.groups[g].x[p][b]
                                         n[b] = self.surfaces.surface[g][p][b]
                                         weight *= grid.scheme.spline.at(way[b] * grid.inverse_spacing)
-                                    if side == 0:
-                                        n_a += weight * n
-                                    else:
-                                        n_c += weight * n
+                                    if ti.static(self.pairs > 0):
+                                        if side == 0:
+                                            n_a += weight * n
+                                        else:
+                                            n_c += weight * n
                                     weights[side] += weight
+                                    point, lever = ti.Vector.zero(float, d), 0.0
                                     for b in ti.static(range(d)):
-                                        slopes[side, b] += weight * self.surfaces.surface[g][p][d + 1 + b]
-                                    depth = self.surfaces.surface[g][p][d]
+                                        slopes[side, b] += weight * self.surfaces.surface[g][p][2 * d + b]
+                                        point[b] = self.surfaces.surface[g][p][d + b]
+                                        lever += point[b] * way[b] * grid.inverse_spacing**2
                                     if counts[side] < self.capacity:
                                         slot = (2 * at.thread + side) * self.stride + counts[side]
                                         if c >= self.layers:
                                             # The point moves with v + C (y - x), C = D^-1 sum w_i v_i (x_i - x)^T.
-                                            lever = depth * way.dot(n) * grid.inverse_spacing**2
                                             weight *= 1.0 + ti.static(grid.scheme.spline.inverse_moment) * lever
                                         for b in ti.static(range(d)):
                                             # Entry by entry, because Taichi may lose vectors assigned as a whole.
-                                            way[b] -= depth * n[b]
+                                            way[b] -= point[b]
                                             self.points[slot + b * self.capacity] = outwards * way[b]
-                                            self.points[slot + ti.static(d + 1 + b) * self.capacity] = outwards * n[b]
-                                        self.points[slot + d * self.capacity] = way.norm_sqr() / (2.0 * BALL * h)
+                                            if ti.static(self.pairs > 0):
+                                                normal = slot + ti.static(d + 1 + b) * self.capacity
+                                                self.points[normal] = outwards * n[b]
+                                        if ti.static(self.pairs > 0):
+                                            self.points[slot + d * self.capacity] = way.norm_sqr() / (2.0 * BALL * h)
                                         self.points[slot + ti.static(2 * d + 1) * self.capacity] = weight
                                         counts[side] += 1
                                 p = self.surfaces.following[g][p]

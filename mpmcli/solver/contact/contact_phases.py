@@ -4,15 +4,18 @@ from collections.abc import Sequence
 
 from mpmcli.boundaries.feature import Phase
 from mpmcli.quick_taichi import ti
-from mpmcli.solver.contact.surfaces import Obstacles
+from mpmcli.solver.contact.surfaces import Obstacles, place_of
 from mpmcli.solver.grid.grid import Grid
 from mpmcli.solver.particles.arrays import ParticleArrays
 
 PUSH = "let bodies push each other"
 
 
-def contact_phases(groups: Sequence[ParticleArrays], *, serial: bool) -> tuple[Phase, ...]:
-    """Return the phases between the relaxation of volumes and the walls; for `serial` see `Feature.phases`."""
+def contact_phases(groups: Sequence[ParticleArrays], *, serial: bool, couples: bool) -> tuple[Phase, ...]:
+    """Return the phases between the relaxation of volumes and the walls; for `serial` see `Feature.phases`.
+
+    If the contact `couples` with rigid bodies, their velocities are found before all impulses.
+    """
     shown = [g for g, group in enumerate(groups) if group.surfaced]
     lists = (
         (Phase("link_surfaces", "particles", "exchange", part=link_part),)
@@ -30,7 +33,17 @@ def contact_phases(groups: Sequence[ParticleArrays], *, serial: bool) -> tuple[P
             for g in shown
         ),
         *lists,
+        *(rigid_phases() if couples else ()),
         Phase("exchange", "threads", "exchange", part=exchange_part, item=exchange_item, words=PUSH),
+        *[Phase("absorb", "runs", "exchange", part=absorb_part, item=absorb_item)] * couples,
+    )
+
+
+def rigid_phases() -> tuple[Phase, ...]:
+    """Return the phases that find the velocities of rigid bodies after their contact with bodies."""
+    return (
+        Phase("weigh_rigid", "threads", "exchange", part=weigh_part, item=weigh_item, words="meet rigid bodies"),
+        Phase("find_rigid", "runs", "exchange", part=find_rigid_part, item=find_rigid_item),
     )
 
 
@@ -47,6 +60,7 @@ class ContactNode:
         gravity_step: change of velocity by gravity in the step, m/s.
         thread: index of the thread of the batch, see `BodyContact.points`.
         node, index: the node, and its index in layer 0; variables of a kernel that may change.
+        rigid: the rigid bodies of the run, None without any.
     """
 
     def __init__(
@@ -54,6 +68,50 @@ class ContactNode:
     ) -> None:
         self.grid, self.obstacles, self.step, self.w = grid, obstacles_of(at), at.step, at.w
         self.gravity_step, self.thread, self.node, self.index = gravity_step, thread, node, index
+        self.rigid = at.features.rigid
+
+    @ti.func
+    def rigid_of(self, o: int):
+        """Return the number of the rigid body that is obstacle o, or -1."""
+        k, _i = self.obstacles.collider_of(o)
+        result = -1
+        for j in range(self.rigid.count):
+            if self.rigid.numbers[j] == k:
+                result = j
+        return result
+
+    @ti.func
+    def swing(self, o: int, stiffness: float):
+        """Return k dt^2 / m of the springs on all of obstacle o, an upper bound; 0 unless it is a rigid body.
+
+        `stiffness` is that of a spring per volume of cells, times dt^2, kg/m^3 m^2.
+        """
+        j, result = self.rigid_of(o), 0.0
+        if j >= 0:
+            _k, i = self.obstacles.collider_of(o)
+            mass = ti.cast(self.rigid.mass[self.w * self.rigid.count + j], float)
+            width = 2.0 * self.rigid.colliders.reach[i][1, 0]
+            result = stiffness / self.grid.spacing * width ** ti.static(self.grid.dimension - 1) / mass
+        return result
+
+    @ti.func
+    def weigh(self, o: int, impulse: ti.template(), n: ti.template(), yields: float, holds: float):
+        """Add to the sums of obstacle o, a rigid body, an impulse that it would take, N s.
+
+        The impulse decreases with the velocity of the body by `yields` along the normal n, and by `holds` across, kg.
+        """
+        rigid, loads, d = ti.static((self.rigid, self.rigid.colliders.loads, self.grid.dimension))
+        _k, i = self.obstacles.collider_of(o)
+        arm = place_of(self.node, self.grid.spacing) - rigid.colliders.place[i]
+        row = (self.w * loads.rows + loads.row_of(self.node)) * rigid.count + self.rigid_of(o)
+        load = loads.of(impulse, arm)
+        for a in ti.static(range(rigid.loads)):
+            rigid.sums[row, a] = rigid.sums[row, a] + ti.cast(load[a], ti.f64)
+        rigid.resist(row, ti.cast(loads.of(n, arm), ti.f64), yields - holds)
+        if holds > 0.0:
+            for c in ti.static(range(d)):
+                along = ti.Vector.unit(d, c, float)
+                rigid.resist(row, ti.cast(loads.of(along, arm), ti.f64), holds)
 
 
 @ti.func
@@ -157,18 +215,72 @@ def at_bins(phases: ti.template(), at: ti.template(), do: ti.template()):
 @ti.func
 def exchange_part(phases: ti.template(), at: ti.template()):
     """Exchange momentum between bodies in contact at nodes, and with walls and colliders."""
+    exchange_in_part(phases, at, False)
+
+
+@ti.func
+def weigh_part(phases: ti.template(), at: ti.template()):
+    """Sum what rigid bodies would take."""
+    exchange_in_part(phases, at, True)
+
+
+@ti.func
+def exchange_in_part(phases: ti.template(), at: ti.template(), weighs: ti.template()):
+    """Visit the nodes of a part."""
     (grid,) = ti.static(near_bodies(phases, at))
-    gravity_step, last = phases.gravity_of(at.step), ti.static(phases.dimension - 1)
     first, after = rows_near_bodies(phases, grid, at)
-    thread = at.w * ti.static(phases.regions) + at.t
     for row in range(first, after):
-        node = grid.row_start(row)
-        index = grid.linear_index(node)
-        (here,) = ti.static((ContactNode(at, grid, gravity_step, thread, node, index),))
-        for _ in range(grid.row_length(node)):
-            phases.device.features.contact.exchange_all(here)
-            node[last] += 1
-            index += 1
+        exchange_in_row(phases, at, row, at.w * ti.static(phases.regions) + at.t, weighs)
+
+
+@ti.func
+def exchange_in_row(phases: ti.template(), at: ti.template(), row: int, thread: int, weighs: ti.template()):
+    """Visit the nodes of a row."""
+    (grid,) = ti.static(near_bodies(phases, at))
+    gravity_step, node = phases.gravity_of(at.step), grid.row_start(row)
+    index = grid.linear_index(node)
+    (here,) = ti.static((ContactNode(at, grid, gravity_step, thread, node, index),))
+    for _ in range(grid.row_length(node)):
+        phases.device.features.contact.exchange_all(here, weighs)
+        node[ti.static(phases.dimension - 1)] += 1
+        index += 1
+
+
+@ti.func
+def weigh_item(phases: ti.template(), at: ti.template()):
+    """Sum what rigid bodies would take from some rows."""
+    (grid,) = ti.static(near_bodies(phases, at))
+    (contact,) = ti.static((phases.device.features.contact,))
+    row = at.q
+    while row < grid.row_count():
+        exchange_in_row(phases, at, row, at.w * contact.threads + at.q, True)
+        row += contact.threads
+
+
+@ti.func
+def find_rigid_part(phases: ti.template(), at: ti.template()):
+    """Find the velocities of rigid bodies."""
+    if at.region == 0 and at.part == 0:
+        at.features.rigid.solve(at.w, at.run.dt)
+
+
+@ti.func
+def find_rigid_item(phases: ti.template(), at: ti.template()):
+    """Find the velocities of rigid bodies of a run."""
+    at.features.rigid.solve(at.w, at.run.dt)
+
+
+@ti.func
+def absorb_part(phases: ti.template(), at: ti.template()):
+    """Give rigid bodies what bodies have lost."""
+    if at.region == 0 and at.part == 0:
+        at.features.rigid.absorb_all(at.w, at.run.dt)
+
+
+@ti.func
+def absorb_item(phases: ti.template(), at: ti.template()):
+    """Give rigid bodies of a run what bodies have lost."""
+    at.features.rigid.absorb_all(at.w, at.run.dt)
 
 
 @ti.func
@@ -181,5 +293,5 @@ def exchange_item(phases: ti.template(), at: ti.template()):
         node = grid.box_node(q)
         index = grid.linear_index(node)
         (here,) = ti.static((ContactNode(at, grid, gravity_step, thread, node, index),))
-        contact.exchange_all(here)
+        contact.exchange_all(here, False)
         q += contact.threads

@@ -90,7 +90,7 @@ def on_face(surfaces: ti.template(), at: ti.template(), g: ti.template(), p: int
     result = False
     for a in ti.static(range(d)):
         n = surfaces.surface[g][p][a]
-        y = surfaces.groups[g].x[p][a] + surfaces.surface[g][p][d] * n
+        y = surfaces.groups[g].x[p][a] + surfaces.surface[g][p][d + a]
         last = ti.cast(walls.last[a] - walls.first, float) * h
         result = result or (ti.abs(n) > ALIKE and ti.min(y, last - y) < 0.25 * h)
     return result

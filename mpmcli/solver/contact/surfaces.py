@@ -1,9 +1,10 @@
 """Surface data of bodies with their own velocity fields, near nodes where they may be in contact.
 
 Each particle stores the depth D below the nearest face of its body at rest, and the normal N of that face. Under F they
-become d = D / |F^-T N| and n = F^-T N / |F^-T N|, and x + d n is a point of the surface. Where plastic flow changes F,
-particles store d and n. Particles with a surface point ("shown" particles) are inserted into bins, one for each node at
-which stencils begin. Contact with separating walls and colliders uses their exact distance.
+become d = D / |F^-T N| and n = F^-T N / |F^-T N|, and the point that was on the face is at x + D F N. Where plastic
+flow changes F, particles store d and n, and the point is x + d n. Particles with a surface point ("shown" particles)
+are inserted into bins, one for each node at which stencils begin. Contact with separating walls and colliders uses
+their exact distance.
 """
 
 from collections.abc import Sequence
@@ -222,7 +223,7 @@ class BodySurfaces:
         counted, rank, slots, reserved: on a GPU, number of particles per bin; rank of each particle in its bin; the
             particles, bin by bin; and number of reserved slots per run.
         shown: layer of each particle, or HIDDEN.
-        surface: per particle, the normal n of the body, the depth d below the surface, m, and dv/dn, 1/s.
+        surface: per particle, the normal n of the body, the way to its point of the surface, m, and dv/dn, 1/s.
     """
 
     def __init__(
@@ -253,7 +254,7 @@ class BodySurfaces:
             self.first[g] = ti.field(int, shape=runs * grid.node_count)
             self.following[g], self.shown[g] = ti.field(int, shape=room), ti.field(int, shape=room)
             self.end[g] = ti.field(int, shape=orders[g].start.shape)
-            self.surface[g] = ti.Vector.field(2 * d + 1, float, shape=room)
+            self.surface[g] = ti.Vector.field(3 * d, float, shape=room)
         self.counted, self.rank, self.slots, self.reserved = {}, {}, {}, {}
         for g in () if on_cpu else self.surfaced:
             self.counted[g] = ti.field(int, shape=runs * grid.node_count)
@@ -558,27 +559,28 @@ class BodySurfaces:
         base, _ = grid.scheme.spline.stencil(group.x[p], grid.inverse_spacing)
         shown, layer = HIDDEN, group.layer_of(p)
         band = self.band[w * self.layers + layer]
-        # Particles that are deeper at rest are farther from the surface than the band, unless they are crushed.
-        if group.carried[p][d] < CRUSHED * band:
+        # Those of elastic bodies are always the same: one that came or went inside an obstacle would bring or take
+        # energy. Where plastic flow changes depths, they are known only now, unless particles are crushed.
+        if group.carried[p][d] < ti.static(CRUSHED if group.law.projects else 1.0) * band:
             bin_ = self.bin_of(grid, w, base)
             if bin_ >= 0 and self.first[g][ti.max(bin_, 0)] != CLOSED:
                 N = ti.Vector.zero(float, d)
                 for c in ti.static(range(d)):
                     N[c] = group.carried[p][c]
-                n = N
+                n, way = N, N
                 if ti.static(not group.law.projects):
-                    n = group.stored(p).inverse().transpose() @ N
+                    F = group.stored(p)
+                    n, way = F.inverse().transpose() @ N, F @ N
                 size = n.norm()
-                depth = group.carried[p][d] / size
-                if depth < band:
+                if ti.static(not group.law.projects) or group.carried[p][d] / size < band:
                     shown = layer
                     for c in ti.static(range(d)):
                         self.surface[g][p][c] = n[c] / size
                         slope = 0.0
                         for a in ti.static(range(d)):
                             slope += group.gradient[p][a, c] * n[a] / size
-                        self.surface[g][p][d + 1 + c] = slope
-                    self.surface[g][p][d] = depth
+                        self.surface[g][p][d + c] = group.carried[p][d] * way[c]
+                        self.surface[g][p][2 * d + c] = slope
         self.shown[g][p] = shown
 
     @ti.func

@@ -30,7 +30,6 @@ def refusals(scene: Scene, backend: Backend) -> list[str]:
                 here: single,
                 "in a domain with periodic walls": any(scene.domain.periodic),
                 "with moving walls": bool(scene.domain.wall_velocity),
-                "with separating bodies": layers.separate,
             },
             "omit their density",
         ),

@@ -88,7 +88,7 @@ def _table() -> dict:
 
 def cost_of(scene: Scene, optimisation: Optimisation) -> Cost:
     """Return the cost of a scene at a level of optimisation; a plugin law costs as much as the most expensive law."""
-    table, axis, h = _table(), scene.dimension - 2, scene.domain.spacing
+    table, axis, h, layers = _table(), scene.dimension - 2, scene.domain.spacing, Layers.of(scene)
     how = "few" if optimisation == "few" else "most"
     known = {law: entry[how][axis] for law, entry in table["laws"].items()}
     costs = {s.material.law: known.get(s.material.law, max(known.values())) for s in scene.sources}
@@ -100,7 +100,8 @@ def cost_of(scene: Scene, optimisation: Optimisation) -> Cost:
         "colliders": any(not collider.free for collider in scene.colliders),
         "rigid": any(collider.free for collider in scene.colliders),
         "emitters": bool(scene.emitters),
-        "separate": Layers.of(scene).separate,
+        "separate": layers.separate and layers.count > 1,
+        "alone": layers.separate and layers.count == 1,
     }
     for name in (name for name, there in beside.items() if there):
         more, factor = table["beside"][name][axis]

@@ -6,16 +6,18 @@ from copy import copy
 from mpmcli.boundaries.rows import Rows
 from mpmcli.boundaries.walls import MovingFaces, RoughFaces
 from mpmcli.quick_taichi import ti
+from mpmcli.scene.domain import SEPARATING
 from mpmcli.solver.contact.total_solids import ParticleContact
 from mpmcli.solver.grid.grid import Grid, LinearNodes
 from mpmcli.solver.grid.period import opaque
-from mpmcli.solver.particles.arrays import MASS, VOLUME
+from mpmcli.solver.particles.arrays import MASS, VOLUME, ParticleArrays
 from mpmcli.solver.particles.state_bounds import deformation_rate, volume_ratio
 from mpmcli.solver.transfer.particle_step import Loads, NodeSums, Receiver, Sender, g2p, loads_on, p2g
 from mpmcli.solver.transfer.run_sums import RunSums, move_to
 from mpmcli.solver.transfer.splines import PAD
 from mpmcli.solver.transfer.stencils import add_linear, columns, gather_linear
 from mpmcli.solver.transfer.volume import level_volume, missing_growth, relax_volume
+from mpmcli.stability.limits import OVERLAP
 
 
 @ti.func
@@ -222,12 +224,21 @@ class ParticleUpdate:
         else:
             ti.atomic_min(self.lost[self.first_lost + g], p)
 
+    def farthest(self, group: ParticleArrays, axis: int, side: int) -> float:
+        """Return how far beyond a face particles of a group may be, cells.
+
+        Beyond an open face they move on until the next sort retires them. Springs push back what overlaps a wall, which
+        would lose what they have stored if particles stopped at it.
+        """
+        springs = group.surfaced and self.faces[axis][side] in SEPARATING
+        return BEYOND if (axis, side) in self.grid.opens else OVERLAP * springs
+
     @ti.func
     def moved(self, group: ti.template(), x: ti.template(), remainder: ti.template(), v: ti.template(), dt: float):
         """Return the new position of a particle after dt, its new remainder, and the distance beyond the domain, all m.
 
         The remainder is the rounding error of x, so that the sum is compensated (Dekker 1971; docs/theory.md, 8.3). The
-        position is clamped to the domain, except at open faces and along periodic axes.
+        position is clamped to the domain, except along periodic axes, and to some distance beyond, see `farthest`.
         """
         inside, after, beyond = ti.Vector.zero(float, self.dimension), ti.Vector.zero(float, self.dimension), 0.0
         for c in ti.static(range(self.dimension)):
@@ -237,18 +248,14 @@ class ParticleUpdate:
                 inside[c], after[c], out = self.grid.period.moved(group, x[c], way, self.extent[c], c)
                 beyond += out * self.grid.spacing
             else:
-                low, high = 0.0, self.extent[c]
-                # A particle moves on beyond an open face until the next sort retires it.
-                if ti.static((c, 0) in self.grid.opens):
-                    low = -BEYOND * self.grid.spacing
-                if ti.static((c, 1) in self.grid.opens):
-                    high = self.extent[c] + BEYOND * self.grid.spacing
+                low = -ti.static(self.farthest(group, c, 0)) * self.grid.spacing
+                high = self.extent[c] + ti.static(self.farthest(group, c, 1)) * self.grid.spacing
                 inside[c] = ti.select(moved > low, moved, low)
                 inside[c] = ti.select(inside[c] < high, inside[c], high)
                 beyond += ti.abs(moved - inside[c])
                 if ti.static(group.carries):
                     after[c] = ti.select(moved == inside[c], way - (opaque(inside[c]) - x[c]), 0.0)
-                    if ti.static((c, 0) in self.grid.opens):
+                    if ti.static(self.farthest(group, c, 0) > 0.0):
                         # `opaque` requires non-negative numbers.
                         after[c] = ti.select(inside[c] > 0.0, after[c], 0.0)
         return inside, after, beyond
