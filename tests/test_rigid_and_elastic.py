@@ -130,7 +130,7 @@ def test_a_ball_that_hits_a_rigid_one_off_its_centre(backend_of: Callable, dimen
 
 
 def test_a_gpu_does_the_same(backend_of: Callable) -> None:
-    """Its path in double precision on the CPU, with walls, gravity, and a body that lies on the jelly soon."""
+    """Its path in double precision on the CPU, while an elastic ball hits a rigid one."""
     scene = discs(2, 5.0, gravity=[0.0, -9.81])
     check_same(*(after_steps(scene, backend) for backend in (backend_of("f64"), on_gpu_path(backend_of("f64")))))
 
