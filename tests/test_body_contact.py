@@ -14,6 +14,7 @@ from solver_state import bodies_of, scene_of
 from mpmcli.errors import InputError
 from mpmcli.frames.frame import Frame
 from mpmcli.scene import Scene, sample_bodies
+from mpmcli.scene.contact_table import ContactTable
 from mpmcli.scene.forces import Contact
 from mpmcli.solver.contact.layers import STICKS, Layers
 from mpmcli.solver.contact.surfaces import rest_surface
@@ -70,10 +71,10 @@ def test_elastic_bodies_have_layers_of_their_own() -> None:
     mixed = scene([a, water, b], friction=0.3)
     assert Layers.of(mixed).numbers == (1, 0, 2)
     assert Layers.of(mixed).frictions(mixed)[np.tril_indices(3, -1)].tolist() == [0.0, 0.0, 0.3]
-    assert Layers.of(scene([a, b])) == Layers(2, False, 2, (0, 1))
+    assert Layers.of(scene([a, b])) == Layers(2, False, 2, False, (0, 1))
     welds = scene([a, b | {"material": metal(surface_friction="stick")}])
     assert Layers.of(scene([a, b | {"material": metal()}])).numbers == (0, 1) and Layers.of(welds).numbers == (1, 0)
-    assert Layers.of(scene([a, water])) == Layers(2, True, 2, (1, 0))
+    assert Layers.of(scene([a, water])) == Layers(2, True, 2, False, (1, 0))
     alone, glued = Layers.of(scene([a])), Layers.of(scene([a, b], contact={"default": "stick"}))
     assert (alone.count, alone.separate, glued.count, glued.separate) == (1, True, 1, False)
 
@@ -82,14 +83,14 @@ def test_elastic_bodies_separate_unless_they_meet_nothing_or_the_solver_has_one_
     """Without a word about contact, and with friction for those that separate."""
     water = body("water", [2, 2], [4, 4], material={"law": "fluid", "density": 1000.0, "bulk_modulus": 1e5})
     a, b = (body(name, [x, 2], [x + 2, 4], material="jelly") for name, x in (("a", 6), ("b", 12)))
-    assert Layers.of(scene([a], contact={})) == Layers(1, False, 2, (0,))
+    assert Layers.of(scene([a], contact={})) == Layers(1, False, 2, False, (0,))
     assert not Layers.of(scene([a], contact={}, domain={"walls": "slip"})).separate
-    assert Layers.of(scene([a, water], contact={})) == Layers(2, True, 2, (1, 0))
-    assert Layers.of(scene([a, water], contact={}, domain={"walls": "slip"})) == Layers(2, True, 2, (1, 0))
+    assert Layers.of(scene([a, water], contact={})) == Layers(2, True, 2, False, (1, 0))
+    assert Layers.of(scene([a, water], contact={}, domain={"walls": "slip"})) == Layers(2, True, 2, False, (1, 0))
     both = scene([a, b], contact={})
-    assert Layers.of(both) == Layers.of(scene([a, b])) and both.friction_between(*both.bodies) == 0.02
+    assert Layers.of(both) == Layers.of(scene([a, b])) and ContactTable(both).between(0, 1)[0] == 0.02
     rough = scene([a, b], contact={"friction": 0.4})
-    assert rough.friction_between(*rough.bodies) == 0.4
+    assert ContactTable(rough).between(0, 1) == (0.4, "contact.friction")
     raft = {"name": "raft", "density": 500.0, "shape": {"box": {"min": [1.0, 0.5], "max": [1.5, 0.7]}}}
     assert Layers.of(scene([a, b], contact={}, colliders=[raft])).separate
     for reason, tables in (
@@ -98,7 +99,7 @@ def test_elastic_bodies_separate_unless_they_meet_nothing_or_the_solver_has_one_
         ("so many bodies", {"domain": {"size": [1600.0, 1600.0]}}),
     ):
         asked = scene([a, b], contact={}, **tables)
-        assert asked.one_field == reason and not Layers.of(asked).separate
+        assert ContactTable(asked).one_field == reason and not Layers.of(asked).separate
         require_possible(asked, Backend("cpu", 1, "f32", False))
 
 
@@ -141,7 +142,7 @@ def test_friction_is_that_of_the_softer_body_where_none_is_given() -> None:
     assert Layers.of(one).frictions(one)[np.tril_indices(3, -1)].tolist() == [0.5, 0.0, 0.0]
     presets = [body(name, [x, 2], [x + 2, 4], material=name) for name, x in (("jelly", 2), ("rubber", 6))]
     one = scene(presets, contact={"default": "separate"})
-    assert one.friction_between(*one.bodies) == 0.02
+    assert ContactTable(one).between(0, 1) == (0.02, "surface_friction")
     assert one.bodies[1].material.surface_friction == 1.0
 
 
@@ -520,7 +521,7 @@ def test_three_bodies_keep_what_they_have(backend_of: Callable) -> None:
     assert np.abs(turns - turns[0]).max() < 1e-12 * first.mass * 4 * 3
     energy = np.array([row.kinetic + row.elastic for _, row in frames])
     assert energy.max() <= energy[0] * (1 + 1e-9)
-    assert thrown().contact_pairs == (("a", "b"), ("a", "c"), ("b", "c"))
+    assert ContactTable(thrown()).pairs == (("a", "b"), ("a", "c"), ("b", "c"))
     for (before, _), (after, row) in pairwise(frames):
         on_first = np.hstack([row.contact_force, row.contact_torque]) * (after.time - before.time)
         changes = np.array([on_first[0] + on_first[1], on_first[2] - on_first[0], -on_first[1] - on_first[2]])

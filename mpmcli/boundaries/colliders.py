@@ -74,7 +74,6 @@ class ColliderKind:
     samples: int
     free: tuple[int, ...] = ()  # indices of the colliders that move freely
     points: int = 0  # number of points on the surfaces of free colliders
-    touched: bool = False  # whether any does not hold
     cornered: bool = False  # whether any has corners, and whether any has several parts
     combined: bool = False
 
@@ -92,23 +91,20 @@ class ColliderKind:
             sum(part.samples.size for part in parts if part.samples is not None),
             tuple(k for k, collider in enumerate(found) if collider.free),
             sum(len(contact_points(collider, h)) for collider in found if collider.free),
-            any(collider.wall != "hold" for collider in found),
             any(any(corners_of(collider)) for collider in found),
             len(parts) > len(found),
         )
 
     def joined(self, other: "ColliderKind") -> "ColliderKind | None":
         """Return the kind that has room for both, or None if they need different kernels."""
-        if any(getattr(self, name) != getattr(other, name) for name in ("moving", "free", "touched")):
+        if any(getattr(self, name) != getattr(other, name) for name in ("moving", "free")):
             return None
         if (self.count > 0) != (other.count > 0):
             return None
         forms = tuple(sorted({*self.forms, *other.forms}))
         rooms = (max(getattr(self, name), getattr(other, name)) for name in ("count", "parts", "numbers", "samples"))
         either = (getattr(self, name) or getattr(other, name) for name in ("cornered", "combined"))
-        return ColliderKind(
-            forms, self.moving, *rooms, self.free, max(self.points, other.points), self.touched, *either
-        )
+        return ColliderKind(forms, self.moving, *rooms, self.free, max(self.points, other.points), *either)
 
 
 def corners_of(collider: Collider) -> tuple[bool, bool]:

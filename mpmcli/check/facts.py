@@ -10,6 +10,7 @@ from mpmcli.check.geometry import image_shifts, spanned_axes, thickness
 from mpmcli.check.scene_limits import SceneLimit, joined, law_of, reachable, scene_limits, starts_of
 from mpmcli.materials.law import Law, StateBound
 from mpmcli.scene import Body, Scene, SceneBounds
+from mpmcli.scene.contact_table import ContactTable
 from mpmcli.scene.sampling import moves_unevenly
 
 # Lower bound on a thickness, m. A process that runs Taichi flushes smaller numbers to 0.
@@ -77,13 +78,13 @@ class BodyFacts:
 class SceneFacts:
     """Quantities of a scene; those of the bodies are computed on first use.
 
-    `bounds` are the largest speed, gravity, height and density that it can reach; `starts` the deformation of each
-    body; `binding` is the smallest of the `limits` in any state, and `step` safety times it, s; `interval` is between
-    frames, s.
+    `contacts` is how all meet, `bounds` are the largest speed, gravity, height and density that it can reach; `starts`
+    the deformation of each body; `binding` is the smallest of the `limits` in any state, and `step` safety times it, s;
+    `interval` is between frames, s.
     """
 
     def __init__(self, scene: Scene) -> None:
-        self.scene = scene
+        self.scene, self.contacts = scene, ContactTable(scene)
         self.starts = starts_of(scene)
         self.deformed = any(start.bound != StateBound() for start in self.starts)
         self.bounds: SceneBounds = reachable(scene, self.starts)

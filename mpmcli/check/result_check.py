@@ -11,6 +11,7 @@ import numpy as np
 
 from mpmcli.check.collider_work import unsure_work, work_of_colliders
 from mpmcli.check.finding import Finding, FrameFindings, Verdict, passes
+from mpmcli.check.result_contact import ContactCheck
 from mpmcli.check.result_entries import RUN_AGAIN, Entry, OpenedResult, check_order, open_entries
 from mpmcli.check.result_state import (
     AT_REST,
@@ -191,6 +192,7 @@ def _check_frames(opened: OpenedResult, findings: FrameFindings, stop: Callable[
     header = opened.header
     state, stretch, momentum = (kind(header, findings) for kind in (StateCheck, StretchCheck, MomentumCheck))
     crowd, rest = CrowdCheck(header, findings, opened.last), RestCheck(header, findings, opened.last)
+    contact = ContactCheck(header, findings)
     size = 0
     for entry in opened.entries:
         if stop():
@@ -212,8 +214,10 @@ def _check_frames(opened: OpenedResult, findings: FrameFindings, stop: Callable[
             momentum.check(frame, entry.row)
             crowd.check(frame)
             rest.check(frame, entry.row)
+            contact.check(frame, entry.row)
             if not header.particle_count_varies:
                 stretch.check(frame)
+    contact.end()
     return {**stretch.figures, **crowd.figures, **momentum.figures, "bytes": size}
 
 

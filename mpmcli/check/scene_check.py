@@ -17,6 +17,7 @@ from mpmcli.cores import available_cores
 from mpmcli.errors import InputError
 from mpmcli.plain_text import counted, size_text, text_table
 from mpmcli.scene import LoadedScene
+from mpmcli.scene.contact_table import ContactTable
 from mpmcli.scene.problem import several
 from mpmcli.solver.engine.plan import Plan, make_plan
 from mpmcli.solver.machine.backend import Backend
@@ -45,7 +46,7 @@ class SceneCheck:
         return passes(self.findings, strict=strict)
 
     def text(self) -> str:
-        """Return the check as text: limits, findings, plan, forecast, and the outcome."""
+        """Return the check as text: contact, limits, findings, plan, forecast, and the outcome."""
         facts, first, later = self.facts, self.facts.binding_at_start, self.facts.binding
         steps = [f"Step that is safe throughout: {facts.step:.4g} s. {later.why} {later.fix}"]
         if first is not later:
@@ -57,6 +58,7 @@ class SceneCheck:
         counted_findings = [counted(counts[word], word) for word in SEVERITIES if counts[word]]
         parts = [
             "\n".join(filter(None, [self.loaded.scene.title, *self.loaded.notes])),
+            _contact_text(facts.contacts),
             _limits_text(facts),
             "\n".join(steps),
             _findings_text(findings),
@@ -89,6 +91,7 @@ class SceneCheck:
             "title": self.loaded.scene.title,
             "step": facts.step,
             "step_at_start": facts.step_at_start,
+            "contacts": [dict(vars(row)) for row in facts.contacts.rows()],
             "limits": [
                 {**limit.as_dict(), "binds": limit is always, "binds_at_start": limit is at_start}
                 for limit in facts.limits
@@ -135,6 +138,16 @@ def check_scene(
         fix = "Use slower bodies, a stiffer material, or a lower time.safety."
         findings.append(Finding("error", "probe", what, fix, probe.steps))
     return SceneCheck(loaded, facts, gravest_first(findings), plan, forecast)
+
+
+def _contact_text(contacts: ContactTable) -> str:
+    """Return one row for each kind of contact."""
+    rows = []
+    for row in contacts.rows():
+        second = "each other" if row.second == row.first else several(list(row.second), 2)
+        friction = "sticks" if row.friction is None else f"{row.friction:g}"
+        rows.append((several(list(row.first), 2), second, row.method, friction, row.source))
+    return text_table(("contact of", "with", "at", "friction", "by"), rows, left={0, 1, 2, 4}) if rows else ""
 
 
 def _limits_text(facts: SceneFacts) -> str:

@@ -79,13 +79,13 @@ def _thin(facts: SceneFacts) -> Iterator[Finding]:
 
 
 def _gaps(facts: SceneFacts) -> Iterator[Finding]:
-    h = facts.scene.domain.spacing
-    bodies = facts.scene.bodies
+    h, table = facts.scene.domain.spacing, facts.contacts
+    bodies, fields = facts.scene.bodies, table.numbers
     reach = REACH[facts.scene.solver.kernel]
     for i, j, distance in close_pairs(facts.scene, [body.shape.form for body in bodies], reach * h):
         cells = distance / h
         first, second = bodies[i], bodies[j]
-        if cells <= TOUCHING or cells >= reach * (1 - 1e-6) or facts.scene.friction_between(first, second) is not None:
+        if cells <= TOUCHING or cells >= reach * (1 - 1e-6) or table.between(fields[i], fields[j])[0] is not None:
             continue
         # Bodies with equal velocity would come to rest in contact; bodies that pass each other are dragged along.
         passing = not np.array_equal(first.velocity, second.velocity)
@@ -99,21 +99,21 @@ def _gaps(facts: SceneFacts) -> Iterator[Finding]:
 
 def _sticking(facts: SceneFacts) -> Iterator[Finding]:
     """Yield elastic bodies that stick although they could separate, in a scene that does not set contact."""
-    scene = facts.scene
+    scene, table = facts.scene, facts.contacts
     elastic = [source.name for source in scene.sources if source.has_surface]
-    if not elastic or scene.contact.default != "auto" or scene.parts or scene.contact.pairs:
+    if not elastic or scene.contact.default != "auto" or table.parts or scene.contact.pairs:
         return
     reach = REACH[scene.solver.kernel]
     if len(elastic) > 1:
         how = f"share one velocity field: they act on each other within {reach:g} cells, and do not slide on each other"
         if scene.solver.solids == "total":
             how = "meet a quarter of a cell early, and slide on each other without friction"
-        what = f"With {scene.one_field} the elastic bodies {several(quoted(elastic))} {how}."
+        what = f"With {table.one_field} the elastic bodies {several(quoted(elastic))} {how}."
         fix = "Change this to resolve contact at their surfaces."
         yield Finding("note", "contact", what, fix, len(elastic), elastic[0])
         return
-    if scene.one_field and scene.has_obstacles:
-        what = f'With {scene.one_field} body "{elastic[0]}" meets walls and colliders on the grid, and does not roll.'
+    if table.one_field and table.has_obstacles:
+        what = f'With {table.one_field} body "{elastic[0]}" meets walls and colliders on the grid, and does not roll.'
         fix = "Change this to resolve contact at its surface."
         yield Finding("note", "contact", what, fix, 1, elastic[0])
 
@@ -121,8 +121,8 @@ def _sticking(facts: SceneFacts) -> Iterator[Finding]:
 def _welding(facts: SceneFacts) -> Iterator[Finding]:
     """Yield solids that weld on contact, because those that yield share one velocity field."""
     scene = facts.scene
-    yielding = [one.name for one in scene.sources if one.material.law in WELDING and not scene.separates(one)]
-    if yielding and len(yielding) + sum(one.has_surface and not scene.parts for one in scene.sources) > 1:
+    yielding = [one.name for one in scene.sources if one.material.law in WELDING and not facts.contacts.separates(one)]
+    if yielding and len(yielding) + sum(one.has_surface and not facts.contacts.parts for one in scene.sources) > 1:
         what = f"The material of {several(quoted(yielding))} yields: solids that it meets weld to it, and do not slide."
         fix = "Nothing needs to be done; with a surface_friction, metal and clay separate."
         yield Finding("note", "weld", what, fix, len(yielding), yielding[0])
@@ -137,7 +137,7 @@ def _walls(facts: SceneFacts) -> Iterator[Finding]:
         for a, axis in enumerate(AXES[: facts.scene.dimension]):
             gaps = {f"{axis}_min": lower[a] - domain.origin[a], f"{axis}_max": domain.upper[a] - upper[a]}
             for (face, gap), word in zip(gaps.items(), words[a], strict=True):
-                meets = word in SEPARATING and facts.scene.separates(body.body)
+                meets = word in SEPARATING and facts.contacts.separates(body.body)
                 if not meets and not domain.periodic[a] and 1e-3 < gap / h < WALL_REACH * (1 - 1e-6):
                     begins = f'Body "{body.name}" begins {gap / h:.2g} cells from the wall {face}'
                     what = f"{begins}, which already acts on it."

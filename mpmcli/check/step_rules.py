@@ -94,9 +94,6 @@ def _stiff(facts: SceneFacts) -> Iterator[Finding]:
     body = next((one for one in facts.scene.bodies if one.name == binding.body), None)
     if body is None or not body.material.solid or body.shape.points or len(facts.scene.sources) < 2:
         return
-    if any(facts.scene.separates(source) for source in facts.scene.sources):
-        # Rigid bodies are not available beside these.
-        return
     times = min(limit.value for limit in facts.limits if limit.body != binding.body) / binding.value
     if times < MUCH_STIFFER:
         return
@@ -193,7 +190,7 @@ def _impact(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
     if isinstance(form, Ball):
         # The zone that an impact of a ball brings into contact, sqrt(2 h / R + 4 mach) per side.
         share = min(1.0, (2 * h / form.radius + 4 * mach) ** ((len(form.center) - 1) / 2))
-    length, surfaces = chord(form, velocity / speed), scene.separates(body.body)
+    length, surfaces = chord(form, velocity / speed), facts.contacts.separates(body.body)
 
     def lost(settings: SolverSettings, spacing: float) -> float:
         # Waves cross as many cells in a step with any spacing.

@@ -94,7 +94,7 @@ def _heap(facts: SceneFacts) -> Iterator[Finding]:
 
 def _welds(facts: SceneFacts) -> Iterator[Finding]:
     """Yield plastic solids, which share a velocity field and join where they meet."""
-    shared = (one for one in facts.bodies if not facts.scene.separates(one.body))
+    shared = (one for one in facts.bodies if not facts.contacts.separates(one.body))
     plastic = (one for one in shared if one.law.deformation == "F" and one.law.projects)
     solid = [one.name for one in plastic if one.body.material.law != "sand"]
     if len(solid) > 1:

@@ -20,6 +20,7 @@ from mpmcli.materials.registry import parameter_models
 from mpmcli.output.durable import sealed, writing
 from mpmcli.output.result import Result
 from mpmcli.scene import LoadedScene, Scene, parse_scene, sample_bodies
+from mpmcli.scene.contact_table import ContactTable
 from mpmcli.scene.expression import Expression
 from mpmcli.scene.problem import several
 from mpmcli.simulation.engine import backend_for
@@ -59,7 +60,8 @@ class Study:
     def warnings(self) -> list[str]:
         """Return sentences on errors that the bars do not contain."""
         found = []
-        shared = [source for source in self.scene.sources if not self.scene.separates(source)]
+        table = ContactTable(self.scene)
+        shared = [source for source in self.scene.sources if not table.separates(source)]
         if len(shared) > 1 and any(source.has_surface for source in shared):
             found.append('Bodies stick: the bar does not contain that; contact.default = "separate" parts them.')
         if self.scene.colliders and not all(source.has_surface for source in self.scene.sources):

@@ -32,7 +32,7 @@ class LedgerRow:
             hardly any cell is inside. collider_force, collider_torque: on each collider, N, and about its pivot, N m:
             means since the previous frame of the momentum that it took from the material (0 at frame 0); per metre of
             depth in 2D. contact_force, contact_torque: for each pair of bodies of which one has a velocity field of its
-            own, see `Scene.contact_pairs`, means of the force on the first by the second, N, and about the domain's
+            own, see `ContactTable.pairs`, means of the force on the first by the second, N, and about the domain's
             origin, N m. contact_overlap, contact_gap: deepest overlap of surfaces that met, and their largest gap while
             they acted on each other, since the previous frame, in cells; contact_work: work of contact on
             what it parts since the previous frame, J: negative while its springs take up energy. These three are None

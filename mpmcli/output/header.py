@@ -12,6 +12,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
 from mpmcli import __version__
 from mpmcli.scene import Scene
 from mpmcli.scene.colliders import Collider, ColliderShape
+from mpmcli.scene.contact_table import ContactTable
 from mpmcli.scene.domain import OPEN, PERIODIC, STICKING, Walls
 from mpmcli.scene.entry import definitions
 from mpmcli.scene.mesh import ClosedSurface, Mesh
@@ -68,6 +69,11 @@ class _Output(_Facts):
     drop_retired: bool = False
 
 
+class _Contact(_Facts):
+    friction: float | None = None
+    pairs: tuple[dict[str, Any], ...] = ()
+
+
 class _Body(_Facts):
     material: dict[str, Any] = {}
     shape: dict[str, Any] = {}
@@ -89,6 +95,7 @@ class _StoredScene(_Facts):
     time: _Time = _Time()
     solver: _Solver = _Solver()
     output: _Output = _Output()
+    contact: _Contact = _Contact()
     constants: dict[str, Any] = {}
     bodies: tuple[_Body, ...] = ()
     emitters: tuple[_Body, ...] = ()
@@ -171,7 +178,7 @@ class RunHeader:
         periodic: (d,), whether the domain repeats along each axis.
         faces: the conditions of the lower and the upper wall of each axis; empty if unknown.
         bodies: in the order of their labels in the frames.
-        contacts: see `Scene.contact_pairs`.
+        contacts: see `ContactTable.pairs`.
         laws: in the order of the labels in the frames.
         end: s; frames: expected, the initial one included.
         precision: "f32" or "f64"; backend: "arch" and "precision".
@@ -236,7 +243,7 @@ class RunHeader:
             }
             | ({"emitter_volumes": [sheets.particles * sheets.volume for sheets in emitted]} if emitted else {})
             | ({"chosen": chosen} if any(chosen) else {})
-            | ({"contacts": [list(pair) for pair in scene.contact_pairs]} if scene.contact_pairs else {})
+            | ({"contacts": [list(pair) for pair in pairs]} if (pairs := ContactTable(scene).pairs) else {})
         )
 
     @classmethod

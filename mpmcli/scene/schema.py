@@ -1,6 +1,5 @@
 """The tables of a scene: one frozen model per table, each key with its unit, range and default."""
 
-import math
 from functools import lru_cache
 from typing import Annotated, Any, ClassVar, Literal, Union, get_args
 
@@ -15,16 +14,12 @@ from pydantic import (
 )
 
 from mpmcli.scene.colliders import Collider
-from mpmcli.scene.domain import SEPARATING, Domain
+from mpmcli.scene.domain import Domain
 from mpmcli.scene.entry import ConstantTable, OfTime, StartDeformation, StartMatrix, StartVector
 from mpmcli.scene.forces import Contact, Force, Impulse
 from mpmcli.scene.material import MaterialParameters
 from mpmcli.scene.quantity import NAME, Flag, Integer, NotNegative, Positive, Table, Vector, flaw, scene_dimension
 from mpmcli.scene.shapes import OneShape
-
-# A node stores the numbers of the velocity fields with mass in bytes of one integer; of more than eight, the first are
-# lost. And the largest number of nodes of all fields with contact.default = "auto", which take 1 GB in 3D.
-MOST_FIELDS, MOST_NODES = 255, 2**26
 
 
 def usual_particles_per_cell(dimension: int) -> int:
@@ -372,60 +367,6 @@ class Scene(Table):
     def dimension(self) -> int:
         """Return 2 or 3."""
         return len(self.domain.size)
-
-    def friction_between(self, first: "Body | Emitter", second: "Body | Emitter") -> float | None:
-        """Return the coefficient of friction of two bodies, None where they stick to each other."""
-        for pair in self.contact.pairs:
-            if set(pair.between) == {first.name, second.name}:
-                return None if pair.friction == "stick" else pair.friction
-        bodies = [body for body in (first, second) if body.has_surface]
-        if not (self.parts and bodies):
-            return None
-        if any(body.material.hydrostatic for body in (first, second)):
-            return 0.0
-        if self.contact.friction is not None:
-            return self.contact.friction
-        # That of the softer body, the lower of two equally soft ones; a plugin's law may have none.
-        materials = [body.material for body in bodies]
-        return min((own.shear_modulus, getattr(own, "surface_friction", 0.0)) for own in materials)[1]
-
-    @property
-    def parts(self) -> bool:
-        """Whether elastic bodies separate from all that are not in `contact.pairs`."""
-        if self.contact.default != "auto":
-            return self.contact.default == "separate"
-        elastic = any(source.has_surface for source in self.sources)
-        return elastic and (len(self.sources) > 1 or self.has_obstacles) and not self.one_field
-
-    @property
-    def has_obstacles(self) -> bool:
-        """Whether there is a wall or a collider that separates."""
-        faces = self.domain.walls.faces(self.dimension)
-        return any(SEPARATING & {*pair} for pair in faces) or any(one.wall == "separate" for one in self.colliders)
-
-    @property
-    def one_field(self) -> str:
-        """What makes all bodies share one velocity field, a setting or their number; "" if nothing does."""
-        solver = self.solver
-        fields = 1 + sum(source.has_surface for source in self.sources)
-        found = {
-            'solver.solids = "total"': solver.solids == "total",
-            'solver.grid = "sparse"': solver.grid == "sparse",
-            "so many bodies": fields > MOST_FIELDS or fields * math.prod(self.domain.cells) > MOST_NODES,
-        }
-        return next((setting for setting, given in found.items() if given), "")
-
-    def separates(self, source: "Body | Emitter") -> bool:
-        """Return whether a body has its own velocity field: contact is then resolved at its surface."""
-        named = any(source.name in pair.between and pair.friction != "stick" for pair in self.contact.pairs)
-        return source.has_surface and (named or self.parts)
-
-    @property
-    def contact_pairs(self) -> tuple[tuple[str, str], ...]:
-        """Names of each pair of velocity fields, in the order of the ledger; bodies that separate have their own."""
-        shared = ", ".join(source.name for source in self.sources if not self.separates(source))
-        names = [shared] * bool(shared) + [source.name for source in self.sources if self.separates(source)]
-        return tuple((first, second) for k, second in enumerate(names) for first in names[:k])
 
     @property
     def sources(self) -> "tuple[Body | Emitter, ...]":

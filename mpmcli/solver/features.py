@@ -63,7 +63,7 @@ class Features:
         if kind.layers.separate:
             how = {"on_cpu": on_cpu, "couples": bool(kind.colliders.free)}
             self.contact = BodyContact(groups, orders, grid, kind.layers, runs, backend.threads, **how)
-        if kind.by_points:
+        if kind.layers.by_points:
             self.colliders.support = grid.scheme.spline.nodes / 2
             fills = any(law.relaxes for law in kind.members)
             how = {"fills": fills, "sparse": grid.sparse}

@@ -1,4 +1,4 @@
-"""Bodies of a scene with their own velocity fields, and the friction between pairs of them."""
+"""The layers of nodes of a run: one for each velocity field of its scene."""
 
 import math
 from dataclasses import dataclass, field
@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mpmcli.scene import Scene
+from mpmcli.scene.contact_table import ContactTable
 from mpmcli.scene.sampling import points_per_cell
 
 # Used instead of a coefficient of friction: both layers have the same velocity at common nodes.
@@ -17,30 +18,30 @@ MODULUS, SHARPNESS, FLAT, DENSITY, AREA, FRICTION = range(6)
 
 @dataclass(frozen=True)
 class Layers:
-    """The layers of nodes of a run: each separating body has its own layer with a velocity field.
+    """The layers of nodes of a run, after the `ContactTable` of its scene.
 
     Attributes:
         count: number of layers; 1 if all bodies share one velocity field or there is a single body.
         shares: whether layer 0 belongs to all bodies without their own layer.
         per_axis: largest number of particles along the edge of a cell, of all bodies with their own layers.
+        by_points: whether colliders act at points of their surfaces on the bodies that share a layer.
         numbers: layer of each source.
     """
 
     count: int
     shares: bool
     per_axis: int
+    by_points: bool
     numbers: tuple[int, ...] = field(compare=False)
 
     @staticmethod
     def of(scene: Scene) -> "Layers":
         """Return the layers of a scene."""
-        sources, own = scene.sources, [scene.separates(source) for source in scene.sources]
-        if not any(own):
-            return Layers(1, True, 1, (0,) * len(own))
-        shares = not all(own)
-        numbers = tuple(shares + sum(own[:i]) if one else 0 for i, one in enumerate(own))
-        densest = max(points_per_cell(sources[i], scene.domain.spacing) for i, one in enumerate(own) if one)
-        return Layers(shares + sum(own), shares, math.ceil(densest ** (1 / scene.dimension)), numbers)
+        table = ContactTable(scene)
+        own = [source for source in scene.sources if table.separates(source)]
+        densest = max((points_per_cell(source, scene.domain.spacing) for source in own), default=1.0)
+        per_axis = math.ceil(densest ** (1 / scene.dimension))
+        return Layers(max(1, len(table.fields)), table.shares, per_axis, table.by_points, table.numbers)
 
     @property
     def separate(self) -> bool:
@@ -57,19 +58,10 @@ class Layers:
         return self.numbers[source] > 0 or not self.shares
 
     def frictions(self, scene: Scene) -> np.ndarray:
-        """Return the coefficient of friction of each pair of layers, (count, count), `STICKS` for sticking pairs.
-
-        Of the bodies that share layer 0 the one with the lowest counts, and any that sticks.
-        """
-        result = np.full((self.count, self.count), np.inf)
-        for i, one in enumerate(scene.sources):
-            for k, other in enumerate(scene.sources[:i]):
-                friction, a, c = scene.friction_between(one, other), self.numbers[i], self.numbers[k]
-                result[a, c] = result[c, a] = min(result[a, c], STICKS if friction is None else friction)
-        result[np.isinf(result)] = STICKS
+        """Return the coefficient of friction of each pair of layers, (count, count), `STICKS` for sticking pairs."""
+        table, result = ContactTable(scene), np.full((self.count, self.count), STICKS)
+        for a in range(self.count):
+            for b in range(a):
+                friction, _ = table.between(a, b)
+                result[a, b] = result[b, a] = STICKS if friction is None else friction
         return result
-
-
-def touched(scene: Scene, layers: Layers) -> bool:
-    """Return whether colliders act at points of their surfaces: some do not hold, and bodies share a layer."""
-    return layers.shares and any(collider.wall != "hold" for collider in scene.colliders)

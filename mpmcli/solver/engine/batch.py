@@ -189,7 +189,7 @@ class Batch:
             layers=kind.layers.count,
             **sparse,
         )
-        grid.has_solids = kind.by_points and kind.keeps_filling
+        grid.has_solids = kind.layers.by_points and kind.keeps_filling
         if kind.fine:
             grid.fine = (FineBlocks if sparse else FineGrid)(grid, kind.fine)
         return grid

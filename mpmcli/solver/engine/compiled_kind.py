@@ -64,11 +64,6 @@ class CompiledKind:
     layers: Layers
     members: tuple[Law, ...] = field(compare=False, repr=False)
 
-    @property
-    def by_points(self) -> bool:
-        """Whether colliders act at points of their surfaces on the bodies that share a layer."""
-        return self.colliders.touched and self.layers.shares
-
     @staticmethod
     def of(scene: Scene, particles: Sequence[BodyParticles] | None = None) -> "CompiledKind":
         """Return the kind of a scene with these particles, one entry per source; without, they are counted."""

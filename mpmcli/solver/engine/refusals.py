@@ -2,9 +2,8 @@
 
 from mpmcli.errors import InputError
 from mpmcli.scene import Scene
-from mpmcli.scene.schema import MOST_FIELDS
+from mpmcli.scene.contact_table import MOST_FIELDS, ContactTable
 from mpmcli.solver.contact.layers import Layers
-from mpmcli.solver.grid.sparse_grid import wants_sparse
 from mpmcli.solver.machine.backend import Backend
 
 
@@ -19,8 +18,7 @@ def refusals(scene: Scene, backend: Backend) -> list[str]:
             {
                 here: single,
                 "with solver.deterministic = true on a GPU": solver.deterministic and on_gpu,
-                'with solver.solids = "total"': total,
-                'with solver.grid = "sparse"': wants_sparse(scene),
+                **{f"with {what}": applies for what, applies in ContactTable(scene).excluded.items() if "=" in what},
                 f"for more than {MOST_FIELDS} bodies": layers.count > MOST_FIELDS,
             },
             'change this, or set contact.default = "stick" and omit the pairs',

@@ -15,6 +15,7 @@ import psutil
 from mpmcli.boundaries.walls import REACH
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
+from mpmcli.scene.contact_table import ContactTable
 from mpmcli.scene.sampling import estimate_body
 from mpmcli.scene.sheets import sheets_of
 from mpmcli.solver.grid.grid import Grid, LinearNodes, drift_allowed
@@ -494,7 +495,7 @@ def wants_sparse(scene: Scene) -> bool:
     """Return whether the grid of a scene is sparse on the CPU; the result does not depend on the machine."""
     if scene.solver.grid != "auto":
         return scene.solver.grid == "sparse"
-    if any(map(scene.separates, scene.sources)):
+    if any(map(ContactTable(scene).separates, scene.sources)):
         return False
     cells = math.prod(scene.domain.cells)
     return cells >= MANY_CELLS and filled_cells(scene) <= FILLED * cells

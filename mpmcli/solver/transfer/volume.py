@@ -21,7 +21,7 @@ from mpmcli.materials.tensors import volume_strain
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
 from mpmcli.scene.schema import SolverSettings
-from mpmcli.solver.contact.layers import Layers, touched
+from mpmcli.solver.contact.layers import Layers
 from mpmcli.solver.particles.arrays import MASS, VOLUME
 from mpmcli.solver.particles.state_bounds import volume_ratio
 from mpmcli.solver.transfer.lanes import (
@@ -236,7 +236,7 @@ def needs_filling(scene: Scene, laws: Sequence[Law], layers: Layers) -> bool:
     With a single density, a single layer and no colliders that it touches, it follows from their mass.
     """
     alike = len({body.material.density for body in scene.sources}) == 1 and layers.count == 1
-    return any(law.relaxes for law in laws) and (touched(scene, layers) or not alike)
+    return any(law.relaxes for law in laws) and (layers.by_points or not alike)
 
 
 @ti.func
