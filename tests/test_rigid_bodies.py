@@ -629,6 +629,18 @@ def test_bodies_that_are_alone_move_as_beside_material(backend_of: Callable, gri
     assert found[0] == pytest.approx(poses, abs=1e-9) and found[1] == pytest.approx(rates, abs=1e-8)
 
 
+@pytest.mark.parametrize("threads", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_a_ball_alone_falls_with_g(backend_of: Callable, threads: int) -> None:
+    """Without particles no node is in use; the product of two negative extents crashed."""
+    ball = {"name": "ball", "density": 500.0, "shape": {"ball": {"center": [0.5] * 3, "radius": 0.1}}}
+    domain = {"size": [1.0] * 3, "spacing": 0.1, "gravity": [0.0, 0.0, -G]}
+    asked = scene_of(domain=domain, time={"end": 0.2, "frames": 2}, bodies=[], colliders=[ball])
+    run = build_run(asked, backend_of("f32", threads))
+    rows = [row for _, row in run.frames()]
+    assert rows[-1].rigid_pose[0][2] == pytest.approx(0.5 - G * 0.2**2 / 2, abs=1e-6)
+    assert not run.batch.device.grid.box.to_numpy()[1].any()
+
+
 def test_a_scene_of_rigid_bodies_alone_is_a_result(tmp_path: Path) -> None:
     """A ball that falls for 0.2 s: frames without particles, a stable run that goes on, and what VTK reads."""
     ball = '[[colliders]]\nname = "ball"\ndensity = 500.0\nshape = { ball = { center = [0.5, 0.7], radius = 0.1 } }\n'

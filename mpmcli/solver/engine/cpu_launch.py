@@ -211,11 +211,6 @@ class CpuLaunch:
                     self.device.features.surfaces.widen(layer, base)
             if ti.static(self.phases.shared):
                 self.phases.places.divide(g, own)
-        if ti.static(self.device.particle_count_varies):
-            # Without active particles the box must still be valid.
-            if high[0] < 0:
-                for a in ti.static(range(self.dimension)):
-                    low[a], high[a] = PAD, PAD
         for a in ti.static(range(self.dimension)):
             self.stencils[run.w * 2, a], self.stencils[run.w * 2 + 1, a] = low[a], high[a]
         run.drift = 0.0
@@ -228,7 +223,8 @@ class CpuLaunch:
             low, high = self.stencils[run.w * 2, a], self.stencils[run.w * 2 + 1, a]
             first, last = box_of(self.device.grid, a, low, high, drift, PAD + run.cells[a])
             self.device.grid.box[run.w * 2, a] = first
-            self.device.grid.box[run.w * 2 + 1, a] = last - first + 1
+            # Without active particles the box is empty.
+            self.device.grid.box[run.w * 2 + 1, a] = ti.max(last - first + 1, 0)
         if ti.static(self.phases.shared and not self.device.grid.sparse):
             self.phases.places.divide_rows()
 
