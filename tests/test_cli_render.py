@@ -197,6 +197,22 @@ acceleration = ["X - 0.5", 0.0]
 """
 
 
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_scene_of_rigid_bodies_alone_is_drawn(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, dimension: int
+) -> None:
+    """A ball of which a fifth of the width of the domain is seen."""
+    monkeypatch.chdir(tmp_path)
+    domain = f"[domain]\nsize = {[1.0] * dimension}\nspacing = 0.05\n[time]\nend = 0.1\nframes = 1\n"
+    ball = f"shape = {{ ball = {{ center = {[0.5] * dimension}, radius = 0.1 }} }}\n"
+    Path("ball.toml").write_text(domain + '[[colliders]]\nname = "ball"\ndensity = 500.0\n' + ball, encoding="utf-8")
+    assert run_here("render", "ball.toml", "--workers", 1).status == 0
+    with Image.open("ball.png") as picture:
+        pixels = np.asarray(picture.convert("RGB")).astype(int)
+    middle = pixels[pixels.shape[0] // 2, pixels.shape[1] // 2]
+    assert np.abs(pixels[2, 2] - middle).max() > 20
+
+
 def test_the_start_of_a_scene_shows_loads_and_held_parts(tmp_path: Path) -> None:
     """A force spread over a region acts at its centre; an acceleration is a force of m a; what cancels has no arrow."""
     scene = tmp_path / "loaded.toml"

@@ -275,6 +275,24 @@ def test_a_draw_makes_a_scene_and_leaves_the_sweep_alone():
     assert draw(sweep, 3).data["bodies"][0]["velocity"][0] != 99
 
 
+def test_a_scene_of_rigid_bodies_alone_is_drawn():
+    base = """\
+[domain]
+size = [1.0, 1.0]
+cells = [32, 32]
+[time]
+end = 0.1
+frames = 4
+[[colliders]]
+name = "ball"
+density = 500.0
+shape = { ball = { center = [0.5, 0.5], radius = 0.1 } }
+"""
+    vary = 'base = "base.toml"\ncount = 9\n[vary]\n"colliders.ball.density" = { uniform = [100, 200] }\n'
+    (ball,) = draw(sweep_of(vary, base=base), 3).scene(LAWS).scene.colliders
+    assert 100.0 <= ball.density <= 200.0
+
+
 def test_choices_are_not_shared_between_draws():
     sweep = sweep_of(varied('"bodies.stone.velocity" = { choice = [[1.0, 0.0]] }'))
     one = draw(sweep, 0)

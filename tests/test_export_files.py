@@ -2,19 +2,26 @@
 
 import json
 import shutil
+from dataclasses import replace
+from pathlib import Path
 
 import meshio
 import numpy as np
 import pytest
 import pyvista
 import trimesh
-from exports import FRAMES, coming_and_going, exported, metadata_of, refused
+from command import run_here
+from drawn_results import WATER, header, row, write
+from drawn_results import frame as drawn
+from exports import FORMS, FRAMES, coming_and_going, exported, metadata_of, refused
 from made_dataset import made_dataset, made_trajectory, write_dataset
 from made_result import write_made
 
 import mpmcli.dataset
+from mpmcli.dataset.formats import format_named
+from mpmcli.dataset.formats.training import TrainingFormat
 from mpmcli.dataset.subsample import chosen_particles, joined_row
-from mpmcli.output import open_result
+from mpmcli.output import SegmentStore, open_result
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
@@ -161,3 +168,85 @@ def test_points_of_ply_are_those_that_are_there(tmp_path):
     for k in (0, 6, 9):
         cloud = pyvista.read(tmp_path / "out" / f"000000_{k:06d}.ply")
         np.testing.assert_array_equal(cloud.points[:, :2], made.position[k, status[k] == 1].astype(np.float32))
+
+
+LAWS = [{"deformation": "J", "coherent": False}]
+
+
+def jets(directory: Path) -> list[Path]:
+    """Return two results of a jet of which none is there at the start and at the end: with all, and those present.
+
+    Particle k is there from frame k + 1 to k + 3. Frames are 0.05 s apart, and their times sums of steps.
+    """
+    facts, times = header((1.0, 1.0), 0.05, [WATER], laws=LAWS), np.cumsum([0.0, *[0.01] * 50])[::5]
+    facts["scene"] = facts["scene"].replace("[domain]", '[domain]\nwalls = { default = "slip", x_max = "open" }')
+    dropped = facts | {"scene": facts["scene"] + "[output]\ndrop_retired = true\n"}
+    frames = []
+    for k, time in enumerate(times.tolist()):
+        age = k - 1 - np.arange(6)
+        position = np.stack([0.1 * np.clip(age, 0, 2) + 0.1, 0.05 * np.arange(6) + 0.2], axis=1)
+        status = np.where(age < 0, 0, np.where(age > 2, 2, 1)).astype(np.int8)
+        made = drawn(k, position, velocity=(status == 1)[:, None] * [2.0, 0.0])
+        frames.append(replace(made, time=time, fields={"status": status}))
+    write(directory / "whole", facts, frames)
+    write(directory / "present", dropped, [one.of_present for one in frames])
+    return [directory / "whole", directory / "present"]
+
+
+@pytest.mark.parametrize("form", ["npz", "ply", "vtk"])
+def test_a_result_of_those_present_is_exported_as_a_whole_one(tmp_path, form):
+    """To the same bytes; frames of which none is there have no vertices in PLY."""
+    found = []
+    for path in jets(tmp_path):
+        outcome = run_here("export", path, "--to", form, "-o", tmp_path / "out" / path.name)
+        assert outcome.status == 0, outcome.stderr
+        files = (tmp_path / "out" / path.name).glob("000000*")
+        found.append({file.name: file.read_bytes() for file in files})
+    assert found[0] == found[1]
+    if form == "ply":
+        counts = [pyvista.read(tmp_path / "out" / "present" / f"000000_{k:06d}.ply").n_points for k in range(11)]
+        assert counts == [0, 1, 2, 3, 3, 3, 3, 2, 1, 0, 0]
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("form", FORMS)
+def test_rigid_bodies_alone_are_exported_where_they_can_be(tmp_path, form, dimension):
+    """A ball that falls: its surface in PLY and USD, its poses in arrays; training code needs particles."""
+    ball = {"name": "ball", "density": 500.0, "shape": {"ball": {"center": [0.5] * dimension, "radius": 0.1}}}
+    facts = header((1.0,) * dimension, 0.05, [], [ball], laws=[])
+    store, turn = SegmentStore(tmp_path / "run", facts), (0.0,) if dimension == 2 else (1.0, 0.0, 0.0, 0.0)
+    for k in range(4):
+        pose = ((*[0.5] * (dimension - 1), 0.5 - 0.1 * k, *turn),)
+        motion = ((0.0,) * (3 * dimension - 3),)
+        store.write(
+            drawn(k, np.empty((0, dimension))),
+            replace(row(0.01 * k, dimension), rigid_pose=pose, rigid_motion=motion),
+        )
+    store.finish()
+    outcome = run_here("export", tmp_path / "run", "--to", form, "-o", tmp_path / "out")
+    if issubclass(format_named(form), TrainingFormat):
+        assert outcome.status == 2 and "has no particles, which" in outcome.stderr
+        return
+    assert outcome.status == 0, outcome.stderr
+    if form == "ply":
+        for k in range(4):
+            name = f"000000_colliders_{k:06d}.ply"
+            for points in (
+                trimesh.load(tmp_path / "out" / name).vertices,
+                pyvista.read(tmp_path / "out" / name).points,
+            ):
+                away = np.asarray(points)[:, :dimension] - [*[0.5] * (dimension - 1), 0.5 - 0.1 * k]
+                assert np.linalg.norm(away, axis=1) == pytest.approx(0.1, abs=1e-6)
+            assert pyvista.read(tmp_path / "out" / f"000000_{k:06d}.ply").n_points == 0
+        if dimension == 3:
+            assert trimesh.load(tmp_path / "out" / name).volume == pytest.approx(4 / 3 * np.pi * 0.1**3, rel=0.01)
+    if form == "npz":
+        with np.load(tmp_path / "out" / "000000.npz") as file:
+            assert file["position"].shape == (4, 0, dimension)
+            assert file["rigid_pose"][:, 0, dimension - 1] == pytest.approx([0.5, 0.4, 0.3, 0.2])
+    if form == "usd":
+        usd, geom = (pytest.importorskip(f"pxr.{name}") for name in ("Usd", "UsdGeom"))
+        stage = usd.Stage.Open(str(tmp_path / "out" / "000000.usdc"))
+        place = geom.Xformable(stage.GetPrimAtPath("/World/ball")).ComputeLocalToWorldTransform(3).ExtractTranslation()
+        assert place[dimension - 1] == pytest.approx(-0.3, abs=1e-6)
+    assert open_result(tmp_path / "run").to_pyvista(0).n_points == 0

@@ -12,7 +12,7 @@ from mpmcli.dataset.folder import MANIFEST
 from mpmcli.dataset.report import MOST_NAMED, status_of
 from mpmcli.dataset.shard import LABELS, MOVING, SHARDS, SPLITS, SWEEP, TABLES, StoredGroup, moving_names, open_shard
 from mpmcli.errors import InputError
-from mpmcli.frames.frame import ACTIVE, STATUS, Frame
+from mpmcli.frames.frame import ACTIVE, RETIRED, STATUS, WAITING, Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output import Result, open_result
 from mpmcli.output.collider_files import as_they_moved
@@ -151,13 +151,8 @@ class _StoredTrajectory(Trajectory):
 
 class _ResultTrajectory(Trajectory):
     def __init__(self, result: Result) -> None:
-        if result.header.drops:
-            raise InputError(
-                f"{result.path} holds only the particles present (output.drop_retired): a trajectory has the "
-                "same ones in all frames; run the scene without it."
-            )
         counts = result.particle_counts
-        if counts.min() != counts.max():
+        if counts.min() != counts.max() and not result.header.drops:
             raise InputError(
                 f"{result.path} has frames of {counts.min()} to {counts.max()} particles: "
                 "a trajectory has the same ones in all frames."
@@ -188,16 +183,51 @@ class _ResultTrajectory(Trajectory):
         return self._result.ledger
 
     def _read(self, name: str, frames: slice) -> np.ndarray:
-        fields = [name] if name in self.field_names else []
-
-        def array(k: int) -> np.ndarray:
-            frame = self._result.frame(k, fields)
-            return frame.fields[name] if fields else getattr(frame, name)
-
         if name in LABELS:
-            return array(0)
+            return self._array(name, 0)
         chosen = range(self.frame_count)[frames]
-        return np.stack([array(k) for k in chosen]) if chosen else array(0)[None][:0]
+        return np.stack([self._array(name, k) for k in chosen]) if chosen else self._array(name, 0)[None][:0]
+
+    def _array(self, name: str, k: int) -> np.ndarray:
+        """Read an array of the k-th frame."""
+        return _array_of(self._result.frame(k, [name] if name in self.field_names else []), name)
+
+
+def _array_of(frame: Frame, name: str) -> np.ndarray:
+    return frame.fields[name] if name in frame.fields else getattr(frame, name)
+
+
+class _PresentTrajectory(_ResultTrajectory):
+    """A result with only the particles present: row i is that of id i, and zeros where it is absent, but for places.
+
+    A particle that waits is where it is first seen, and one that has gone where it is last seen.
+    """
+
+    def __init__(self, result: Result) -> None:
+        super().__init__(result)
+        n = self.particle_count = 1 + max(int(frame.id.max(initial=-1)) for frame in result.frames([]))
+        self._first, self._last = np.full(n, self.frame_count), np.full(n, -1)
+        self._ends = np.zeros((2, n, result.dimension))
+        self._labels = {name: np.zeros(n, np.int32) for name in LABELS}
+        for k, frame in enumerate(result.frames([])):
+            new = self._first[frame.id] > k
+            self._first[frame.id[new]], self._last[frame.id] = k, k
+            self._ends[0, frame.id[new]], self._ends[1, frame.id] = frame.position[new], frame.position
+            for name, labels in self._labels.items():
+                labels[frame.id] = getattr(frame, name)
+
+    def _array(self, name: str, k: int) -> np.ndarray:
+        if name in LABELS:
+            return self._labels[name]
+        frame = self._result.frame(k, [name] if name in self.field_names else [])
+        own, gone = _array_of(frame, name), self._last < k
+        whole = np.zeros((self.particle_count, *own.shape[1:]), own.dtype)
+        if name == "position":
+            whole[:] = np.where(gone[:, None], self._ends[1], self._ends[0])
+        elif name == STATUS:
+            whole[:] = np.where(gone, RETIRED, WAITING)
+        whole[frame.id] = own
+        return whole
 
 
 class Dataset:
@@ -246,7 +276,7 @@ class Dataset:
             held = f"{len(self)}, from {first} to {last}" if len(self) > 1 else f"number {first} only"
             raise InputError(f"{self.path} has no trajectory {number}: it holds {held}.")
         if isinstance(self._source, Result):
-            return _ResultTrajectory(self._source)
+            return (_PresentTrajectory if self._source.header.drops else _ResultTrajectory)(self._source)
         return _StoredTrajectory(self._source[number], number)
 
     @cached_property

@@ -241,7 +241,7 @@ def _obstacles(
     context = {"dimension": dimension, "constants": constants, "directory": directory}
     boxes: list[RoundedBox] = []
     walls: list[Distance] = []
-    for body in data["bodies"]:
+    for body in data.get("bodies", []):
         if ("bodies", body["name"]) not in templates:
             with suppress(ValidationError, KeyError):
                 boxes.append(rounded_box(BodyShape.model_validate(body["shape"], context=context).form))
@@ -308,9 +308,8 @@ def draw(sweep: Sweep, number: int, given: Mapping[str, Any] = MappingProxyType(
             _put_in_place(data, name, {place.template: bodies for place, bodies in placed if place.list == name})
             for name in ("bodies", "colliders")
         )
-    emitters = data.get("emitters", [])
-    for kind, sources, places in (("bodies", data["bodies"], origins), ("emitters", emitters, range(len(emitters)))):
-        for source, origin in zip(sources, places, strict=True):
+    for kind, places in (("bodies", origins), ("emitters", range(len(data.get("emitters", []))))):
+        for source, origin in zip(data.get(kind, []), places, strict=True):
             if source.get("sampling") in ("jittered", "poisson") and (kind, origin, "seed") not in varied:
                 source["seed"] = int(generator(sweep.seed, number, f"{kind}.{source['name']}.seed").integers(SEEDS))
     source, split = f"{sweep.path}: trajectory {number}", sweep.split_of(number)

@@ -105,11 +105,9 @@ def export(
     always = settings.present == "always"
     chosen = [SubsampledTrajectory(dataset[number], *options, always=always) for number in numbers]
     for each in chosen:
-        if each.particle_count == 0 or each.frame_count == 0:
-            lacks = (
-                "has no particle that is there in all frames" if always and each.source.particle_count else "is empty"
-            )
-            raise InputError(f"trajectory {each.source.number} of {dataset.path} {lacks}: there is nothing to export.")
+        lacks = "particle that is there in all frames" if each.source.particle_count and not each.particle_count else ""
+        if lacks := lacks or "frame" * (each.frame_count == 0):
+            raise InputError(f"trajectory {each.source.number} of {dataset.path} has no {lacks} to export.")
     metadata = common_facts(chosen, settings.stride)
     lack = ""
     if settings.trajectory is None and (dataset.path / MANIFEST).exists():

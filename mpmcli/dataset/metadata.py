@@ -142,7 +142,7 @@ def _present(trajectory: SubsampledTrajectory) -> Iterator[np.ndarray]:
 
 def require_alike(trajectories: Sequence[SubsampledTrajectory], form: str) -> None:
     """Raise an InputError for trajectories that training code cannot or should not load as one set."""
-    first, remedy = trajectories[0], "--to npz takes trajectories that differ."
+    first, remedy = trajectories[0], "--to npz takes any trajectories."
     dt = time_between(first)
     if first.frame_count < LEAST_FRAMES:
         raise InputError(
@@ -151,6 +151,8 @@ def require_alike(trajectories: Sequence[SubsampledTrajectory], form: str) -> No
         )
     for each in trajectories:
         number, header = each.source.number, each.source.header
+        if each.particle_count == 0:
+            raise InputError(f"trajectory {number} has no particles, which {form} needs; {remedy}")
         if header.particle_count_varies and not each.always:
             raise InputError(
                 f"trajectory {number} has particles that come or go, and {form} cannot say which are there: --present "

@@ -154,7 +154,7 @@ class SubsampledTrajectory:
     def spacing(self) -> float | None:
         """Largest initial distance of neighbours, m, as of a coarser lattice if thinned; None: unknown."""
         header = self.source.header
-        if header.spacing is None or not header.bodies:
+        if header.spacing is None or self.particle_count == 0 or not header.bodies:
             return None
         fewest = min(body.particles_per_cell for body in header.bodies)
         share = self.particle_count / max(self.there_count, 1)

@@ -94,7 +94,7 @@ def write_collider_files(
     directory: Path, header: Mapping[str, Any], times: Sequence[float], colliders: Sequence[Collider]
 ) -> None:
     """Write the colliders of a run, if it has any, at the times of its frames, s; RunError: a write failed."""
-    for group in _groups(header, colliders):
+    for group in collider_groups(header, colliders):
         frames = len(times) if group.moves else 1
         size = 24 * sum(len(s.points) for s in group.surfaces) * frames + 32 * len(group.labels) + 2**16
         size += 200 * len(times) + sum(vertices.nbytes + cells.nbytes for vertices, cells in group.meshes.values())
@@ -107,7 +107,7 @@ def write_collider_series(
 ) -> list[str]:
     """Write the colliders of a run as .vtu files and a .pvd, and return their names; RunError: a write failed."""
     entries: list[tuple[float, int, str]] = []
-    for group in _groups(header, colliders):
+    for group in collider_groups(header, colliders):
         size = 64 * (3 * sum(len(s.points) for s in group.surfaces) + 3 * len(group.labels)) + 2**12
         for k, time in enumerate(times):
             name = MOVING_PIECE.format(k) if group.moves else RESTING_PIECE
@@ -129,7 +129,7 @@ def pvd_text(entries: Sequence[tuple[float, int, str]]) -> str:
 
 def expected_files(header: Mapping[str, Any], colliders: Sequence[Collider]) -> list[str]:
     """Return the names of the files that `write_collider_files` makes."""
-    return [group.name for group in _groups(header, colliders)]
+    return [group.name for group in collider_groups(header, colliders)]
 
 
 def read_stored_surfaces(directory: Path) -> dict[int, ClosedSurface]:
@@ -149,7 +149,7 @@ def read_stored_surfaces(directory: Path) -> dict[int, ClosedSurface]:
     return found
 
 
-def _groups(header: Mapping[str, Any], colliders: Sequence[Collider]) -> Iterator[ColliderGroup]:
+def collider_groups(header: Mapping[str, Any], colliders: Sequence[Collider]) -> Iterator[ColliderGroup]:
     """Yield the colliders at rest, then those that move; a group without any is left out."""
     for moving in (False, True):
         members = []

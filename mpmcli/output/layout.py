@@ -136,8 +136,7 @@ class FrameLayout:
     def frame(self, index: int, time: float, step: int, stored: Mapping[str, np.ndarray]) -> Frame:
         """Return a Frame from arrays in the form in the file; `stored` may lack fields."""
         arrays = {name: self.arrays[name].unpad(array) for name, array in stored.items()}
-        arrays.pop("id", None)
-        standard = {name: arrays.pop(name) for name in STANDARD[1:]}
+        standard = {name: arrays.pop(name, None) for name in STANDARD}
         return Frame(index, time, step, position=arrays.pop(POSITION), fields=arrays, **standard)
 
     def to_dict(self) -> dict:

@@ -87,7 +87,8 @@ class Result(ABC):
         """Read the k-th frame with some or all fields, unchanged; InputError: no such frame or field, or no file."""
         if not 0 <= k < self.frame_count:
             raise InputError(f"{self.path} has no frame {k}: it holds frames 0 to {self.frame_count - 1}.")
-        names = [POSITION, *STANDARD[1:], *(self.field_names if fields is None else fields)]
+        # Row i is particle i unless only those present are stored.
+        names = [POSITION, *STANDARD[not self.header.drops :], *(self.field_names if fields is None else fields)]
         for name in names:
             if name not in self.index.layout.arrays:
                 known = ", ".join(self.field_names) or "none"
@@ -132,7 +133,8 @@ class Result(ABC):
             present = arrays[STATUS] == ACTIVE
             arrays = {name: array[present] for name, array in arrays.items()}
         cloud = pyvista.PolyData(arrays.pop(POSITION))
-        for name, array in arrays.items():
+        # PyVista has no empty arrays.
+        for name, array in arrays.items() if cloud.n_points else ():
             cloud.point_data[name] = array
         return cloud
 

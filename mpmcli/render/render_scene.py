@@ -228,7 +228,7 @@ def result_of_start(scene: Scene) -> Iterator[tuple[Result, tuple[Arrow, ...]]]:
     """
     sources, found, d = scene.sources, sample_bodies(scene), scene.dimension
     names = sorted({source.material.law for source in sources})
-    counts = [len(one.position) for one in found]
+    counts, none = [len(one.position) for one in found], np.empty((0, d))
     there, arrows = [], []
     for source, one in zip(sources, found, strict=True):
         shown, velocity = len(one.position), one.velocity.mean(axis=0)
@@ -243,8 +243,10 @@ def result_of_start(scene: Scene) -> Iterator[tuple[Result, tuple[Arrow, ...]]]:
         0,
         0.0,
         0,
-        np.concatenate([one.position for one in found]).astype(np.float32),
-        np.concatenate([np.broadcast_to(one.velocity, one.position.shape) for one in found]).astype(np.float32),
+        np.concatenate([none, *(one.position for one in found)]).astype(np.float32),
+        np.concatenate([none, *(np.broadcast_to(one.velocity, one.position.shape) for one in found)]).astype(
+            np.float32
+        ),
         np.repeat(np.arange(len(sources), dtype=np.int32), counts),
         np.repeat(np.array([names.index(source.material.law) for source in sources], np.int32), counts),
         {STATUS: np.concatenate(there).astype(np.int8)} if scene.particle_count_varies else {},

@@ -19,7 +19,7 @@ FORMATS = {
     "vtkhdf": ("vtk.Vtkhdf", "a result per trajectory, for ParaView and every command of mpmcli"),
     "vtk": ("vtk.Vtk", "a .vtu per frame and a .pvd, for ParaView before 5.12"),
     "usd": ("usd.Usd", "a .usdc per trajectory with colliders as meshes, for Omniverse, Houdini and Blender"),
-    "ply": ("ply.Ply", "a file of points per frame, for Blender, Houdini, trimesh and VTK"),
+    "ply": ("ply.Ply", "a file of points per frame, and of colliders as meshes, for Blender, Houdini, trimesh and VTK"),
 }
 
 

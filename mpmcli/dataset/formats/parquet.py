@@ -85,7 +85,7 @@ class Parquet(ArraysFormat):
         """Return the type of a column for datasets."""
         found, shape = self._columns[name], self._lengths(name)
         dtype, axes = found[0].dtype.name, len(shape)
-        alike = None not in shape[1:] and len(found) == len(self.trajectories)
+        alike = not {None, 0} & {*shape[1:]} and len(found) == len(self.trajectories)
         if alike and 1 < axes <= MOST_AXES:
             return {"name": name, "dtype": {f"array{axes}_d": {"shape": shape, "dtype": dtype}}}
         kind: Any = dtype

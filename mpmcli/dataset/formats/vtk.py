@@ -24,7 +24,7 @@ class Vtkhdf(Format):
     def check(self) -> None:
         if any(each.walls.walls != "none" for each in self.trajectories):
             raise InputError(
-                "--walls is for training code and NumPy; mpmcli render draws the colliders, and --to usd has them."
+                "--walls is for training code and NumPy; mpmcli render draws the colliders; --to usd and ply have them."
             )
 
     def size(self) -> int:

@@ -48,6 +48,7 @@ class Zarr(ArraysFormat):
 
 def _chunk(array: ExportedArray) -> tuple[int, ...]:
     """Return the shape of chunks of nearly equal numbers of frames: Zarr pads the last one."""
-    frames, *rest = array.shape
+    # Chunks have no length of 0.
+    frames, *rest = (max(length, 1) for length in array.shape)
     most = max(1, CHUNK_BYTES // (array.dtype.itemsize * math.prod(rest)))
     return (math.ceil(frames / math.ceil(frames / most)), *rest)
