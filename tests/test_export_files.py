@@ -208,6 +208,48 @@ def test_a_result_of_those_present_is_exported_as_a_whole_one(tmp_path, form):
         assert counts == [0, 1, 2, 3, 3, 3, 3, 2, 1, 0, 0]
 
 
+@pytest.mark.parametrize("stride", [1, 3])
+def test_time_codes_of_usd_are_frames(tmp_path, stride):
+    """Each has the particles of its frame, also where none is there, although times are no whole multiples of one."""
+    usd, geom = (pytest.importorskip(f"pxr.{name}") for name in ("Usd", "UsdGeom"))
+    for path in jets(tmp_path):
+        run_here("export", path, "--to", "usd", "-o", tmp_path / "out", "--stride", stride, "--overwrite")
+        stage, result = usd.Stage.Open(str(tmp_path / "out" / "000000.usdc")), open_result(path)
+        assert stage.GetTimeCodesPerSecond() == pytest.approx(1 / 0.05)
+        points = geom.Points.Get(stage, "/World/Particles")
+        assert points.GetPointsAttr().GetTimeSamples() == list(range(0, 11, stride))
+        for k in range(0, 11, stride):
+            there = result.present_frame(k)
+            found = np.array(points.GetPointsAttr().Get(k)).reshape(-1, 3)
+            np.testing.assert_array_equal(found[:, :2], there.position)
+            assert np.array_equal(points.GetIdsAttr().Get(k), there.id)
+        # A stage that is still open would be read again in place of the next file.
+        stage.Unload()
+        del points, stage
+
+
+@pytest.mark.parametrize(
+    ("gravity", "up"),
+    [
+        ([0.0, 0.0, -9.81], "Z"),
+        ([0.0, -9.81, 0.0], "Y"),
+        ([0.0, "-g * min(t / 0.05, 1)", 0.0], "Y"),
+        ([0.0, "5 * sin(20 * t)", "-g"], "Z"),
+        ([0.0, "-5 * sin(t)", 0.0], "Y"),
+        ([0.0, 0.0, 0.0], "Z"),
+    ],
+)
+def test_up_in_usd_is_against_gravity(tmp_path, gravity, up):
+    """Also where it is an expression."""
+    usd, geom = (pytest.importorskip(f"pxr.{name}") for name in ("Usd", "UsdGeom"))
+    facts = header((1.0, 1.0, 1.0), 0.05, [WATER], laws=LAWS)
+    facts["scene"] = "constants = { g = 9.81 }\n" + facts["scene"].replace("-9.81", "0.0")
+    facts["scene"] = facts["scene"].replace("gravity = [\n    0.0,\n    0.0,\n    0.0,\n]", f"gravity = {gravity}")
+    write(tmp_path / "run", facts, [drawn(0, np.full((2, 3), 0.5))])
+    assert run_here("export", tmp_path / "run", "--to", "usd", "-o", tmp_path / "out").status == 0
+    assert geom.GetStageUpAxis(usd.Stage.Open(str(tmp_path / "out" / "000000.usdc"))) == up
+
+
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("form", FORMS)
 def test_rigid_bodies_alone_are_exported_where_they_can_be(tmp_path, form, dimension):

@@ -7,14 +7,14 @@ from functools import cached_property
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, TypeAdapter, ValidationError
 
 from mpmcli import __version__
 from mpmcli.scene import Scene
 from mpmcli.scene.colliders import Collider, ColliderShape
 from mpmcli.scene.contact_table import ContactTable
 from mpmcli.scene.domain import OPEN, PERIODIC, STICKING, Walls
-from mpmcli.scene.entry import definitions
+from mpmcli.scene.entry import TimeVector, definitions, value_of
 from mpmcli.scene.mesh import ClosedSurface, Mesh
 from mpmcli.scene.quantity import AXES
 from mpmcli.scene.sampling import rest_volume
@@ -23,6 +23,8 @@ from mpmcli.scene.shapes import BodyShape
 from mpmcli.scene.sheets import sheets_of
 from mpmcli.stability.transfer_factors import FARTHEST, INTERVAL
 
+# Times of a run at which gravity is evaluated for its mean.
+MOMENTS = 1001
 _DEFAULTS = {name: field.default for name, field in SolverSettings.model_fields.items()}
 
 
@@ -166,7 +168,8 @@ class RunHeader:
         spacing: h, m.
         origin, upper: corners of the domain, (d,), m; both are known, or neither.
         gravity: (d,), m/s^2; None if it depends on time.
-        steady_gravity: (d,), m/s^2, with 0 for each entry that depends on time; None if unknown.
+        steady_gravity: (d,), m/s^2, with 0 for each entry that depends on time; None if unknown. mean_gravity: its mean
+            over the run.
         driven: whether energy and momentum have a source: forces, moving walls, time-dependent gravity, gravity along a
             periodic axis, or particles that come and go.
         particle_count_varies: whether particles come and go; drops: whether frames contain only the particles present.
@@ -194,6 +197,7 @@ class RunHeader:
     upper: np.ndarray | None
     gravity: np.ndarray | None
     steady_gravity: np.ndarray | None
+    mean_gravity: np.ndarray | None
     driven: bool
     particle_count_varies: bool
     drops: bool
@@ -276,6 +280,7 @@ class RunHeader:
             upper=origin + facts.size if placed else None,
             gravity=None if timed else steady,
             steady_gravity=steady,
+            mean_gravity=None if steady is None else _mean_gravity(scene, d),
             driven=timed or runs_on or moved or particle_count_varies,
             particle_count_varies=particle_count_varies,
             drops=scene.output.drop_retired,
@@ -379,6 +384,14 @@ class RunHeader:
         # In the solver's precision, so that sums agree to the last digits.
         kept = masses.astype(np.float64 if self.precision == "f64" else np.float32).astype(np.float64)
         return kept[body]
+
+
+def _mean_gravity(scene: _StoredScene, d: int) -> np.ndarray:
+    """Return the mean of gravity over a run, (d,), m/s^2."""
+    context = {"dimension": d, "constants": definitions(scene.constants, d)[0]}
+    entries = TypeAdapter(TimeVector).validate_python(list(scene.domain.gravity), context=context)
+    times = np.linspace(0.0, scene.time.end or 0.0, MOMENTS)
+    return np.array([np.nan_to_num(value_of(entry, t=times)).mean() for entry in entries])
 
 
 def _bodies(facts: _StoredHeader) -> tuple[BodyHeader, ...]:

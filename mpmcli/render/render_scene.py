@@ -138,7 +138,7 @@ def render_scene_of(result: Result) -> RenderScene:
     bodies = header.bodies or (BodyHeader("all", {}, None, usual_particles_per_cell(d)),)
     names = tuple(one_line(body.name) for body in bodies)
     appearances, material_of = _materials(names, [body.material for body in bodies])
-    flat, up, gravity = [0.0] * (3 - d), np.zeros(3), header.steady_gravity
+    flat, up, gravity = [0.0] * (3 - d), np.zeros(3), header.mean_gravity
     # In 2D, and without gravity, the last axis is upwards.
     up[d - 1] = 1.0
     if d == 3 and gravity is not None and gravity.any():

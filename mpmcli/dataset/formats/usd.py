@@ -8,7 +8,6 @@ import numpy as np
 
 from mpmcli.dataset.formats.format import Written
 from mpmcli.dataset.formats.vtk import Vtkhdf, stored_frames
-from mpmcli.dataset.metadata import time_between
 from mpmcli.dataset.shard import LABELS, group_name
 from mpmcli.dataset.subsample import SubsampledTrajectory
 from mpmcli.frames.frame import ACTIVE, STATUS
@@ -19,8 +18,9 @@ from mpmcli.scene.surface import collider_surface
 class Usd(Vtkhdf):
     """A .usdc per trajectory: the particles as Points and each collider as a mesh, curves in 2D, with its pose.
 
-    Lengths are in metres. Up is Y in 2D, and in 3D the axis of gravity, Z without. A time code is a frame; particles
-    that wait or have gone are left out; `ids` name them. Scalar fields, `body` and `material` are primvars of a vertex.
+    Lengths are in metres. Up is Y in 2D, and in 3D that of Y and Z along which gravity acts on average, Z without. A
+    time code is the number of a frame; particles that wait or have gone are left out; `ids` name them. Scalar fields,
+    `body` and `material` are primvars of a vertex.
     """
 
     files = r"\d{6,}\.usdc"
@@ -34,15 +34,14 @@ class Usd(Vtkhdf):
         from pxr import UsdGeom
 
         for each in self.trajectories:
-            header, rate = each.source.header, 1 / (time_between(each) or 1.0)
+            header, codes = each.source.header, each.frames.tolist()
+            rate = (codes[-1] - codes[0]) / ((each.times[-1] - each.times[0]) or 1.0) or 1.0
             stage = Stage.Stage.CreateNew(str(directory / f"{group_name(each.source.number)}.usdc"))
-            gravity = np.abs(np.zeros(3) if header.steady_gravity is None else header.steady_gravity)
-            up = "Y" if header.dimension == 2 or gravity[1] > gravity[2] else "Z"
-            UsdGeom.SetStageUpAxis(stage, up)
+            gravity = np.abs(np.zeros(3) if header.mean_gravity is None else header.mean_gravity)
+            UsdGeom.SetStageUpAxis(stage, "Y" if header.dimension == 2 or gravity[1] > gravity[2] else "Z")
             UsdGeom.SetStageMetersPerUnit(stage, 1.0)
             stage.SetTimeCodesPerSecond(rate)
             stage.SetFramesPerSecond(rate)
-            codes = (each.times * rate).tolist()
             stage.SetStartTimeCode(codes[0])
             stage.SetEndTimeCode(codes[-1])
             world = UsdGeom.Xform.Define(stage, "/World")
@@ -55,7 +54,7 @@ class Usd(Vtkhdf):
         return {}, []
 
 
-def _write_particles(stage: Any, trajectory: SubsampledTrajectory, codes: list[float]) -> None:
+def _write_particles(stage: Any, trajectory: SubsampledTrajectory, codes: list[int]) -> None:
     from pxr import Sdf, UsdGeom, Vt
 
     points = UsdGeom.Points.Define(stage, "/World/Particles")
@@ -79,7 +78,7 @@ def _write_particles(stage: Any, trajectory: SubsampledTrajectory, codes: list[f
                 primvar.Set(made.FromNumpy(array.astype(np.int32 if kind == "i" else np.float32)), code)
 
 
-def _write_collider(stage: Any, trajectory: SubsampledTrajectory, k: int, codes: list[float]) -> None:
+def _write_collider(stage: Any, trajectory: SubsampledTrajectory, k: int, codes: list[int]) -> None:
     from pxr import Gf, Tf, UsdGeom, Vt
 
     header, collider = trajectory.source.header, trajectory.source.colliders[k]
