@@ -7,9 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 import pyvista as pv
+from command import run_here
+from drawn_results import JELLY, WATER, frame, header
+from drawn_results import write as write_result
 
 from mpmcli.errors import InputError
 from mpmcli.materials.registry import parameter_models
+from mpmcli.output import open_result
 from mpmcli.scene import Scene, estimate_particles, highest_speed, parse_scene, sample_bodies
 from mpmcli.scene.points import read_points
 
@@ -38,9 +42,9 @@ def write(path: Path, d: int) -> dict[str, Any]:
     return {"file": path.name, "velocity": "motion"}
 
 
-def scene_of(directory: Path, table: dict[str, Any], d: int = 2, **body: Any) -> Scene:
-    """Return a scene of water in points."""
-    data = {
+def scene_data(table: dict[str, Any], d: int = 2, **body: Any) -> dict[str, Any]:
+    """Return the tables of a scene of water in points."""
+    return {
         "domain": {"size": [1.0] * d, "spacing": 0.1},
         "time": {"end": 1.0, "frames": 1},
         "bodies": [
@@ -52,7 +56,12 @@ def scene_of(directory: Path, table: dict[str, Any], d: int = 2, **body: Any) ->
             }
         ],
     }
-    return parse_scene(copy.deepcopy(data), laws=parameter_models(), directory=directory).scene
+
+
+def scene_of(directory: Path, table: dict[str, Any], d: int = 2, **body: Any) -> Scene:
+    """Return that scene."""
+    data = copy.deepcopy(scene_data(table, d, **body))
+    return parse_scene(data, laws=parameter_models(), directory=directory).scene
 
 
 @pytest.mark.parametrize("d", [2, 3])
@@ -172,3 +181,123 @@ def test_points_are_not_combined_and_lie_in_their_plane(tmp_path: Path) -> None:
         InputError, match=r"it must be of numbers, \(n, 2\), or \(n, 4\) with velocities; it is \(4, 5\)"
     ):
         scene_of(tmp_path, {"file": "p.npy", "spacing": 0.1})
+
+
+# Files with several times.
+
+TIMES = (0.0, 0.01, 0.02)
+
+
+@pytest.fixture
+def result(tmp_path: Path) -> Path:
+    """Return the directory of a result of two bodies, of which particle 1 has gone from frame 1 on, in three frames."""
+    facts = header((1.0, 1.0), 0.1, [WATER, JELLY])
+    frames = []
+    for k in range(len(TIMES)):
+        position, gradient = POINTS[2][:6] * (1 - 0.1 * k), np.tile([1.0 + k, 0.5, 0.0, 1.0], (6, 1))
+        own = {"density": np.full(6, 1000.0 / (1 + k)), "deformation_gradient": gradient, "affine": gradient - k}
+        made = frame(k, position, [0, 0, 0, 0, 1, 1], SPEEDS[2][:6] + k, **own)
+        made.fields["status"] = np.array([1, 1 if k == 0 else 2, 1, 1, 1, 1], np.int8)
+        frames.append(made)
+    write_result(tmp_path / "run", facts, frames)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("keys", "k"), [({}, 2), ({"frame": 0}, 0), ({"frame": 1}, 1), ({"time": 0.02}, 2), ({"time": 0.012}, 1)]
+)
+def test_one_of_several_times_is_read_and_said(result: Path, keys: dict, k: int) -> None:
+    """By default the last, and only particles that are there, with their velocity, C, and J from the density."""
+    table = {"file": "run/particles.vtkhdf", "spacing": 0.05, "velocity": "velocity", "body": "body 0", **keys}
+    rows = [0, 2, 3] if k else [0, 1, 2, 3]
+    data = {"law": "fluid", "density": 1000.0, "bulk_modulus": 1e5}
+    scene = scene_of(result, table, material=data)
+    (found,) = sample_bodies(scene)
+    assert found.position == pytest.approx(POINTS[2][rows] * (1 - 0.1 * k), abs=1e-6)
+    assert found.velocity == pytest.approx(SPEEDS[2][rows] + k, abs=1e-6)
+    assert found.deformation == pytest.approx(np.full(len(rows), 1.0 + k))
+    assert found.affine == pytest.approx(np.tile([[1.0, 0.5 - k], [-k, 1.0 - k]], (len(rows), 1, 1)))
+    # The volume that is given is that at rest.
+    assert found.volume == pytest.approx(0.05**2)
+    (note,) = scene.bodies[0].shape.notes
+    assert f"is read at frame {k} of 0 to 2, t = {TIMES[k]:.6g} s" in note
+    assert ("selects another" in note) == (not keys)
+
+
+def test_a_solid_goes_on_with_its_deformation(result: Path) -> None:
+    table = {"file": "run/particles.vtkhdf", "spacing": 0.05, "body": "body 1", "frame": 1}
+    (found,) = sample_bodies(scene_of(result, table, material=JELLY))
+    assert found.deformation == pytest.approx(np.tile([[2.0, 0.5], [0.0, 1.0]], (2, 1, 1)))
+    loaded = parse_scene(scene_data(table, material=JELLY), laws=parameter_models(), directory=result)
+    assert "b: run/particles.vtkhdf has no initial_position (output.fields): as at rest" in loaded.notes
+
+
+@pytest.mark.parametrize(
+    ("keys", "sentence"),
+    [
+        ({"frame": 3}, "points.frame: {}: it has frames 0 to 2; found 3"),
+        ({"time": 0.5}, "points.time: {}: its times are 0 to 0.02 s; found 0.5"),
+        ({"time": 0.01, "frame": 1}, "points.time: is given as well as frame; leave one of them out"),
+        ({"body": "water"}, 'points.body: {}: it has no body "water"; its bodies are "body 0" and "body 1"'),
+    ],
+)
+def test_what_a_result_does_not_have_is_one_sentence(result: Path, keys: dict, sentence: str) -> None:
+    table = {"file": "run/particles.vtkhdf", "spacing": 0.05, **keys}
+    with pytest.raises(InputError) as refused:
+        scene_of(result, table)
+    assert sentence.format(result / "run" / "particles.vtkhdf") in str(refused.value)
+
+
+def test_a_file_of_one_time_has_no_frames(tmp_path: Path) -> None:
+    for name in ("p.csv", "p.vtu"):
+        table = write(tmp_path / name, 2)
+        with pytest.raises(InputError, match="frame is for VTKHDF files, which have several times; leave it out"):
+            scene_of(tmp_path, {**table, "spacing": 0.05, "frame": 1})
+
+
+GOES_ON = """\
+[domain]
+size = [1.4, 0.7]
+spacing = 0.05
+gravity = [0.0, -9.81]
+[time]
+end = {end}
+frames = {frames}
+step = 2e-4
+[solver]
+precision = "f64"
+[output]
+fields = ["velocity", "affine", "deformation_gradient", "initial_position", "plastic_volume_ratio"]
+[[bodies]]
+name = "jelly"
+material = {{ law = "neo_hookean", density = 1000.0, youngs_modulus = 2e4, poissons_ratio = 0.3 }}
+shape = {{ {jelly} }}
+{velocity}
+[[bodies]]
+name = "snow"
+material = "snow"
+shape = {{ {snow} }}
+{velocity}
+"""
+
+
+def test_a_run_goes_on_from_a_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A jelly on the floor and snow are where the whole run has them, to the half step by which velocities lag."""
+    monkeypatch.chdir(tmp_path)
+    starts = {"jelly": 0.2, "snow": 0.9}
+    boxes = {name: f"box = {{ min = [{x}, 0.05], max = [{x + 0.3:.1f}, 0.35] }}" for name, x in starts.items()}
+    table = 'file = "whole/particles.vtkhdf", total_volume = 0.09, time = 0.08, velocity = "velocity"'
+    parts = {name: f'points = {{ {table}, body = "{name}" }}' for name in starts}
+    runs = {"whole": GOES_ON.format(end=0.16, frames=4, velocity="velocity = [0.0, -1.0]", **boxes)}
+    runs["part"] = GOES_ON.format(end=0.08, frames=2, velocity="", **parts)
+    for name, text in runs.items():
+        Path(f"{name}.toml").write_text(text, encoding="utf-8")
+        done = run_here("simulate", f"{name}.toml", "-o", name, "-q")
+        assert (done.status, done.stderr) == (0, "")
+    whole, part = (open_result(Path(name)) for name in runs)
+    for label in range(2):
+        before, after, found = whole.frame(2), whole.frame(4), part.frame(2)
+        own = after.body == label
+        for name in ("position", "deformation_gradient", *["plastic_volume_ratio"] * label):
+            start, right, here = (frame.fields.get(name, frame.position)[own] for frame in (before, after, found))
+            assert np.linalg.norm(here - right) < 0.1 * np.linalg.norm(right - start), (label, name)

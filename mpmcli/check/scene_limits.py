@@ -10,7 +10,7 @@ from mpmcli.materials.law import Law, StateBound
 from mpmcli.materials.registry import laws
 from mpmcli.scene import Body, Scene, SceneBounds, highest_speed, scene_bounds
 from mpmcli.scene.bounds import body_places, body_points
-from mpmcli.scene.sampling import initial_deformation, initial_motion, moves_unevenly
+from mpmcli.scene.sampling import initial_deformation, initial_motion, moves_unevenly, starts_deformed
 from mpmcli.stability.limits import FIX, WHY, collider_limit, deformation_limit, mode_limit, speed_limit
 from mpmcli.stability.transfer_factors import step_inertia
 
@@ -64,7 +64,7 @@ def starts_of(scene: Scene) -> list[Start]:
     """Return the start of each body, in the order of the scene."""
     starts = [Start()] * len(scene.bodies)
     for index, body in enumerate(scene.bodies):
-        if body.deformation is None and body.initial_pressure is None:
+        if not starts_deformed(body):
             continue
         deformation = initial_deformation(body, body_places(body, index, scene.domain.spacing), scene.domain)
         if deformation.ndim == 1:

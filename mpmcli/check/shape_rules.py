@@ -21,7 +21,7 @@ from mpmcli.scene.domain import OPEN, PASSED, SEPARATING
 from mpmcli.scene.primitives import grid_points
 from mpmcli.scene.problem import quoted, several
 from mpmcli.scene.quantity import AXES
-from mpmcli.scene.sampling import initial_deformation, initial_motion, moves_unevenly
+from mpmcli.scene.sampling import initial_deformation, initial_motion, moves_unevenly, starts_deformed
 from mpmcli.scene.shapes import Mesh
 from mpmcli.scene.surface import form_surface, surface_points
 
@@ -249,7 +249,7 @@ def _stretch_to_come(facts: SceneFacts, body: BodyFacts) -> float:
     """
     stretch, material = 1.0, body.body.material
     points = body_points(body.body)
-    if body.body.deformation is not None:
+    if starts_deformed(body.body):
         F = initial_deformation(body.body, points, facts.scene.domain)
         F = F[np.isfinite(F).reshape(len(F), -1).all(1)]
         least = np.linalg.svd(F, compute_uv=False).min(initial=math.inf) if F.ndim == 3 else math.inf

@@ -12,6 +12,7 @@ from mpmcli.scene.domain import SEPARATING, STICKING
 from mpmcli.scene.entry import entries_in, tree_of, value_of, varies
 from mpmcli.scene.expression import Expression
 from mpmcli.scene.mesh import Mesh, leaving, moved_inside
+from mpmcli.scene.points import Points
 from mpmcli.scene.primitives import Polygon, TurnedBox, grid_points
 from mpmcli.scene.problem import Problem, hint_at, listed
 from mpmcli.scene.quadrature import integral_of, parts_of, telling_times
@@ -24,6 +25,7 @@ from mpmcli.scene.sampling import (
     lattice_spacing,
     no_particles,
     particle_places,
+    starts_deformed,
 )
 from mpmcli.scene.schema import Body, Emitter, ParticleField, Scene
 from mpmcli.scene.shapes import Box, Composite
@@ -253,9 +255,11 @@ def _repeated_names(scene: Scene) -> Iterator[Problem]:
 
 def _outside(scene: Scene) -> Iterator[Problem]:
     domain = scene.domain
-    tolerance = _TOLERANCE * domain.spacing
     for i, body in enumerate(scene.bodies):
-        lower, upper = body.shape.form.bounds()
+        form = body.shape.form
+        # The particles of a result may overlap walls by half a cell.
+        tolerance = (0.5 if isinstance(form, Points) and form.state else _TOLERANCE) * domain.spacing
+        lower, upper = form.bounds()
         faces = []
         for k, axis in enumerate(AXES[: scene.dimension]):
             start, end = domain.origin[k], domain.upper[k]
@@ -269,7 +273,7 @@ def _outside(scene: Scene) -> Iterator[Problem]:
         if said:
             ways = " and ".join(said)
             corners, instead, too_large = (np.array(domain.origin), np.array(domain.upper)), "move it", ""
-            if isinstance(form := body.shape.form, Mesh):
+            if isinstance(form, Mesh):
                 too_large, instead = leaving(form, *corners), f"give translate = {moved_inside(form, *corners)}"
             how = f": {too_large}" if too_large else f" through {ways}; {instead} or enlarge the domain"
             yield Problem(("bodies", i, "shape"), f'body "{body.name}" leaves the domain{how}')
@@ -433,6 +437,9 @@ def _total(scene: Scene) -> Iterator[Problem]:
         if body.deformation is not None:
             said = 'must be left out with solver.solids = "total", whose state at rest is the one at the start'
             yield Problem(("bodies", i, "deformation"), said)
+        elif starts_deformed(body):
+            said = 'starts as a result was, and "total" starts at rest: give solver.solids = "updated"'
+            yield Problem(("bodies", i, "shape"), said)
         yield from _nearly_held(body, i, scene)
     if any(scene.domain.periodic):
         said = '"total" keeps bodies whole on a grid that does not repeat; give solids = "updated", or other walls'

@@ -24,6 +24,7 @@ from mpmcli.scene.problem import (
     Renames,
     hint_at,
     known_keys,
+    listed,
     nearest,
     nearest_entry,
     path_in,
@@ -34,7 +35,7 @@ from mpmcli.scene.problem import (
     value_at,
 )
 from mpmcli.scene.quantity import dimension_of
-from mpmcli.scene.sampling import points_per_cell, rest_volume
+from mpmcli.scene.sampling import missing_state, points_per_cell, rest_volume
 from mpmcli.scene.schema import Scene, scene_model
 from mpmcli.scene.toml_file import apply_overrides, copied, key_lines, line_of, read_toml
 
@@ -163,6 +164,10 @@ def parse_scene(
     for one in (*scene.sources, *scene.colliders):
         for sentence in one.shape.notes:
             notes.setdefault(sentence, []).append(one.name)
+    for body in scene.bodies:
+        if missing := missing_state(body):
+            said = f"{body.shape.points.file} has no {listed(missing, 'and')} (output.fields): as at rest"
+            notes.setdefault(said, []).append(body.name)
     told = tuple(f"{several(names)}: {sentence}" for sentence, names in notes.items())
     return LoadedScene(scene.model_copy(update=resolved), told, source)
 

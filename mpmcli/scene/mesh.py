@@ -209,7 +209,8 @@ def read_mesh(
     `translate`. Vertices at the same place are one, as are triangles. A mesh of cells gives its surface. Shells that
     overlap are united; with `close` holes of few edges are filled.
     """
-    vertices, triangles, changes = _closed(*_read(Path(path)), close)
+    *found, note = _read(Path(path))
+    vertices, triangles, changes = _closed(*found, close)
     whole = ClosedSurface(vertices, triangles).volume
     notes = tuple(
         f"{Path(path).name}: {what}, which {'adds' if volume > 0 else 'takes'} {abs(volume) * scale**3:.3g} m^3, "
@@ -219,11 +220,11 @@ def read_mesh(
     vertices = vertices * scale
     if axis is not None:
         vertices = vertices @ rotation(axis, math.radians(angle)).T
-    return ClosedSurface(vertices + np.array(translate), triangles, notes)
+    return ClosedSurface(vertices + np.array(translate), triangles, (*[note] * bool(note), *notes))
 
 
-def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Return points (n, 3) and triangles (m, 3) of the surface in a file; coincident points are merged."""
+def _read(path: Path) -> tuple[np.ndarray, np.ndarray, str]:
+    """Return points (n, 3), triangles (m, 3) and the note of the surface in a file; coincident points are merged."""
     try:
         found = read_geometry(path)
     except GeometryFileError as error:
@@ -240,7 +241,7 @@ def _read(path: Path) -> tuple[np.ndarray, np.ndarray]:
     # A triangle given twice is one.
     turns = (triangles.argmin(axis=1)[:, None] + np.arange(3)) % 3
     triangles = triangles[np.sort(distinct_rows(np.take_along_axis(triangles, turns, axis=1))[0])]
-    return _compact(vertices, triangles)
+    return *_compact(vertices, triangles), found.note
 
 
 def _compact(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

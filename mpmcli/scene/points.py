@@ -7,10 +7,12 @@ it.
 
 import csv
 import io
+import json
+import tomllib
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import redirect_stderr, redirect_stdout
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
@@ -20,8 +22,10 @@ from pydantic import Field, PrivateAttr, ValidationInfo, model_validator
 
 from mpmcli.scene.primitives import Solid
 from mpmcli.scene.problem import hint_at, listed, quoted
-from mpmcli.scene.quantity import AXES, Positive, Table, Vector, flaw, scene_dimension
+from mpmcli.scene.quantity import AXES, Integer, Number, Positive, Table, Vector, flaw, scene_dimension
 
+# The field of a result with the deformation that a law stores.
+DEFORMATIONS = {"J": "volume_ratio", "F": "deformation_gradient"}
 # Suffixes of files that trimesh reads, and those that PyVista reads: each file is complete, so that one digest covers
 # it. No other file is opened: .pvd, .pvtu, .vtm and more name further files, a pickle runs code, and some readers end
 # the process.
@@ -31,16 +35,62 @@ _BY_VTK = (".glb", ".mesh", ".msh", ".vti", ".vtk", ".vtkhdf", ".vtp", ".vtr", "
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
-    """Points (n, 3) float64 and their arrays by name; vertices (k, 3) and triangles (m, 3) int64 of the surface."""
+    """Points (n, 3) float64 and their arrays by name; vertices (k, 3) and triangles (m, 3) int64 of the surface.
+
+    `note` says which of several times is read; `header` is that of a result of mpmcli.
+    """
 
     points: np.ndarray
     vertices: np.ndarray
     triangles: np.ndarray
     arrays: dict[str, np.ndarray] = field(default_factory=dict)
+    note: str = ""
+    header: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class ResultState:
+    """The state of n particles of a result of mpmcli.
+
+    Attributes:
+        fields: its fields, (n,) or (n, k); deformation_gradient and affine are (n, d, d).
+        body: table of the body, as the scene of the result has it; empty if they are of several bodies.
+    """
+
+    fields: Mapping[str, np.ndarray]
+    body: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What is read of a file: the number of a frame, or a time, s, by default the last; and a body of a result."""
+
+    frame: int | None = None
+    time: float | None = None
+    body: str | None = None
+
+    def of(self, times: np.ndarray) -> int:
+        """Return the index of the frame among those at some times, s."""
+        last = len(times) - 1
+        if self.frame is not None and self.frame > last:
+            raise GeometryFileError(f"it has frames 0 to {last}; found {self.frame}", "frame")
+        if self.time is not None and abs(self.time - np.clip(self.time, times[0], times[-1])) > 1e-6 * np.ptp(times):
+            raise GeometryFileError(f"its times are {times[0]:.6g} to {times[-1]:.6g} s; found {self.time:g}", "time")
+        if self.time is not None:
+            return int(np.abs(times - self.time).argmin())
+        return last if self.frame is None else self.frame
+
+
+LAST = Choice()
 
 
 class GeometryFileError(Exception):
     """The fault of a file, in words that follow its name; empty if it cannot be read."""
+
+    def __init__(self, said: str = "", key: str = "file") -> None:
+        """Store the words, and the key of the scene that is at fault."""
+        super().__init__(said)
+        self.key = key
 
 
 def scene_file(name: str, info: ValidationInfo) -> Path:
@@ -68,8 +118,8 @@ def absence(path: Path) -> str:
         return "there is no such file"
 
 
-def read_geometry(path: Path) -> Geometry:
-    """Return the points and the triangles in a file, or raise a GeometryFileError."""
+def read_geometry(path: Path, choice: Choice = LAST) -> Geometry:
+    """Return the points and the triangles in a file, at one of its times, or raise a GeometryFileError."""
     if path.suffix.lower() not in _BY_TRIMESH + _BY_VTK:
         known = listed([*_BY_TRIMESH, *_BY_VTK], "and")
         raise GeometryFileError(f"the files that are read are {known}; save it as one of these, such as VTU")
@@ -79,7 +129,9 @@ def read_geometry(path: Path) -> Geometry:
         # Readers print on the terminal.
         with warnings.catch_warnings(), redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
             warnings.simplefilter("ignore")
-            return _by_trimesh(path) if path.suffix.lower() in _BY_TRIMESH else _by_vtk(path)
+            return _by_trimesh(path) if path.suffix.lower() in _BY_TRIMESH else _by_vtk(path, choice)
+    except GeometryFileError:
+        raise
     # Readers raise almost any exception at a damaged file; meshio even ends the process.
     except (Exception, SystemExit):
         raise GeometryFileError from None
@@ -129,7 +181,7 @@ def _by_trimesh(path: Path) -> Geometry:
     return Geometry(vertices, vertices, np.array(triangles), arrays)
 
 
-def _by_vtk(path: Path) -> Geometry:
+def _by_vtk(path: Path, choice: Choice) -> Geometry:
     """Return the geometry that PyVista reads, with the surface of solid cells."""
     import pyvista as pv
     from vtkmodules.util.numpy_support import vtk_to_numpy
@@ -141,7 +193,15 @@ def _by_vtk(path: Path) -> Geometry:
     vtkObject.GlobalWarningDisplayOff()
     vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)
     try:
-        found = pv.read(path)
+        reader, note, header = pv.get_reader(path), "", {}
+        if path.suffix.lower() == ".vtkhdf":
+            times, header = _times_in(path)
+            step = choice.of(times)
+            reader.reader.SetStep(step)
+            if len(times) > 1:
+                other = "; frame or time selects another" * (choice.frame is None and choice.time is None)
+                note = f"{path.name} is read at frame {step} of 0 to {len(times) - 1}, t = {times[step]:.6g} s{other}"
+        found = reader.read()
         found = found.combine() if isinstance(found, pv.MultiBlock) else found
         kinds = [found.GetCells()] if found.IsA("vtkUnstructuredGrid") else []
         if found.IsA("vtkPolyData"):
@@ -169,10 +229,21 @@ def _by_vtk(path: Path) -> Geometry:
     arrays = {str(name): np.asarray(data[name]) for name in data.keys()}  # noqa: SIM118
     arrays = {name: array for name, array in arrays.items() if array.dtype.kind in "iuf"}
     if not result.GetNumberOfPolys():
-        return Geometry(points, points[:0], np.empty((0, 3), np.int64), arrays)
+        return Geometry(points, points[:0], np.empty((0, 3), np.int64), arrays, note, header)
     vertices = vtk_to_numpy(result.GetPoints().GetData()).astype(np.float64)
     corners = vtk_to_numpy(result.GetPolys().GetConnectivityArray()).reshape(-1, 3).astype(np.int64)
-    return Geometry(points, vertices, corners, arrays)
+    return Geometry(points, vertices, corners, arrays, note, header)
+
+
+def _times_in(path: Path) -> tuple[np.ndarray, dict[str, Any]]:
+    """Return the times, s, of a VTKHDF file, one without any, and the header of a result of mpmcli."""
+    import h5py
+
+    with h5py.File(path) as file:
+        times = file["VTKHDF/Steps/Values"][()] if "VTKHDF/Steps/Values" in file else np.zeros(1)
+        facts = file["mpmcli"].attrs if "mpmcli" in file else {}
+        ours = "header" in facts and "scene" in facts
+        return times, json.loads(facts["header"]) | {"scene": facts["scene"]} if ours else {}
 
 
 # Readers of tables by suffix, and how programs name the columns of positions, axis by axis.
@@ -180,8 +251,10 @@ _TABLES = (".csv", ".npy", ".npz", ".txt", ".xyz")
 _POSITIONS = ("{axis}", "{AXIS}", "Points:{k}", "Points_{k}", "points:{k}", "position:{k}")
 
 
-def read_points(path: Path, d: int, velocity: str | Sequence[str] | None) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return the points in a file, (n, d), and the requested velocities, (n, d), or None.
+def read_points(
+    path: Path, d: int, velocity: str | Sequence[str] | None, choice: Choice = LAST
+) -> tuple[np.ndarray, np.ndarray | None, ResultState | None, str]:
+    """Return the points in a file, (n, d), the requested velocities, (n, d), the state, each or None, and a note.
 
     The file is a CSV or TXT whose first line names the columns, `_POSITIONS` among them; an XYZ or NPY without names,
     of d, 3 or 2 d columns x, y, z, vx, vy, vz; an NPZ, or an NPY of named columns; or a file that `read_geometry`
@@ -190,6 +263,8 @@ def read_points(path: Path, d: int, velocity: str | Sequence[str] | None) -> tup
     if fault := absence(path):
         raise GeometryFileError(fault)
     suffix = path.suffix.lower()
+    if given := [key for key, value in vars(choice).items() if value is not None and suffix != ".vtkhdf"]:
+        raise GeometryFileError(f"{given[0]} is for VTKHDF files, which have several times; leave it out", given[0])
     if not isinstance(velocity, str | None) and len(velocity) != d:
         raise GeometryFileError(f"velocity must name {d} columns, such as [{', '.join(quoted(_names(d)[d:]))}]")
     if suffix in _TABLES:
@@ -200,12 +275,14 @@ def read_points(path: Path, d: int, velocity: str | Sequence[str] | None) -> tup
             raise GeometryFileError(f"velocity must name {d} columns, such as [{', '.join(quoted(_names(d)[d:]))}]")
         ways = [[way.format(axis=AXES[k], AXIS=AXES[k].upper(), k=k) for k in range(d)] for way in _POSITIONS]
         place = next((way for way in ways if {*way} <= {*columns}), ways[0])
-        found = _chosen(columns, place), None if names is None else _chosen(columns, names)
+        found = _chosen(columns, place), None if names is None else _chosen(columns, names), None, ""
     else:
-        found = _data_set(path, d, velocity)
-    for values in found:
+        found = _data_set(path, d, velocity, choice)
+    stored = found[2].fields if found[2] else {}
+    for values in (*found[:2], *(stored.get(name) for name in (*DEFORMATIONS.values(), "affine"))):
         if values is not None and not np.isfinite(values).all():
-            raise GeometryFileError(f"point {int(np.argmin(np.isfinite(values).all(axis=1))) + 1} is not finite")
+            finite = np.isfinite(values).reshape(len(values), -1).all(axis=1)
+            raise GeometryFileError(f"point {int(np.argmin(finite)) + 1} is not finite")
     if not len(found[0]):
         raise GeometryFileError("it holds no point")
     return found
@@ -304,26 +381,62 @@ def _npy(path: Path, d: int) -> dict[str, np.ndarray]:
     return dict(zip(_names(d), found.astype(np.float64).T, strict=False))
 
 
-def _data_set(path: Path, d: int, velocity: str | Sequence[str] | None) -> tuple[np.ndarray, np.ndarray | None]:
+def _data_set(
+    path: Path, d: int, velocity: str | Sequence[str] | None, choice: Choice
+) -> tuple[np.ndarray, np.ndarray | None, ResultState | None, str]:
     try:
-        found = read_geometry(path)
+        found = read_geometry(path, choice)
     except GeometryFileError as error:
         said = str(error) or "it is not a readable file of points (CSV, XYZ, NPY, NPZ, PLY and VTU are)"
-        raise GeometryFileError(said) from None
+        raise GeometryFileError(said, error.key) from None
+    state = None
+    if found.header:
+        found, state = _of_result(found, d, choice.body)
+    elif choice.body is not None:
+        raise GeometryFileError("it is no result of mpmcli, whose bodies have names", "body")
     if not len(found.points):
-        raise GeometryFileError("it holds no point")
+        raise GeometryFileError("it holds no point" + f" ({found.note})" * bool(found.note))
     position = _in_plane(found.points, d, "points")
+    return position, _velocities(found, d, velocity), state, found.note
+
+
+def _of_result(found: Geometry, d: int, body: str | None) -> tuple[Geometry, ResultState]:
+    """Return the particles of a result that are there, those of one body if it is named, and their state."""
+    names, rows = found.header["bodies"], np.ones(len(found.points), bool)
+    if body is not None:
+        if body not in names:
+            hint = hint_at(body, names, f"its bodies are {listed(quoted(names), 'and')}")
+            raise GeometryFileError(f'it has no body "{body}"; {hint}', "body")
+        rows &= found.arrays["body"] == names.index(body)
+    if "status" in found.arrays:
+        rows &= found.arrays["status"] == 1
+    arrays = {name: array[rows] for name, array in found.arrays.items()}
+    state = {name: array.astype(np.float64) for name, array in arrays.items() if array.dtype.kind == "f"}
+    for name in ("deformation_gradient", "affine"):
+        if name in state:
+            state[name] = state[name].reshape(-1, 3, 3)[:, :d, :d]
+    scene = tomllib.loads(found.header["scene"])
+    tables = [*scene.get("bodies", ()), *scene.get("emitters", ())]
+    if "volume_ratio" not in state and "density" in arrays:
+        rest = np.array([table["material"]["density"] for table in tables])
+        state["volume_ratio"] = rest[arrays["body"]] / arrays["density"]
+    labels = np.unique(arrays["body"])
+    table = tables[labels[0]] if len(labels) == 1 else {}
+    return replace(found, points=found.points[rows], arrays=arrays), ResultState(state, table)
+
+
+def _velocities(found: Geometry, d: int, velocity: str | Sequence[str] | None) -> np.ndarray | None:
     if velocity is None:
-        return position, None
+        return None
     for name in {*([velocity] if isinstance(velocity, str) else velocity)} - {*found.arrays}:
         known = listed(quoted(list(found.arrays)), "and") if found.arrays else "none"
         raise GeometryFileError(f'its points have no array "{name}"; they have {known}')
     if not isinstance(velocity, str):
-        return position, np.stack([np.array(found.arrays[name], np.float64).reshape(-1) for name in velocity], axis=1)
+        return np.stack([np.array(found.arrays[name], np.float64).reshape(-1) for name in velocity], axis=1)
     values = np.array(found.arrays[velocity], dtype=np.float64)
     if values.ndim != 2 or values.shape[1] not in (d, 3):
         raise GeometryFileError(f'its array "{velocity}" must have {d} numbers for each point')
-    return position, _in_plane(values, d, "velocities")
+    return _in_plane(values, d, "velocities")
 
 
 def _in_plane(values: np.ndarray, d: int, what: str) -> np.ndarray:
@@ -335,10 +448,12 @@ def _in_plane(values: np.ndarray, d: int, what: str) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """Points, (n, d), m, and their velocities, (n, d), m/s, or None."""
+    """Points, (n, d), m, their velocities, (n, d), m/s, and their state, or None; `note` says which time was read."""
 
     position: np.ndarray
     velocity: np.ndarray | None
+    state: ResultState | None = None
+    note: str = ""
 
     @cached_property
     def tree(self) -> Any:
@@ -357,6 +472,13 @@ class Points(Table, Solid):
     total_volume: Positive | None = Field(
         None, description="Volume of the whole body, m^3 (m^2 in 2D), in place of spacing."
     )
+    frame: Integer | None = Field(
+        None, ge=0, description="Number of the frame, from 0, of a file with several times. Default: the last."
+    )
+    time: Number | None = Field(None, description="Time, s, in place of frame; the nearest frame is read.")
+    body: str | None = Field(
+        None, description="Name of the body of a result of mpmcli whose particles are read. Default: all."
+    )
     velocity: str | tuple[str, ...] | None = Field(
         None,
         description='Velocities in the file, added to that of the body: names of columns, such as ["vx", "vy"], or the '
@@ -372,9 +494,13 @@ class Points(Table, Solid):
     def _read(self, info: ValidationInfo) -> "Points":
         path, d = scene_file(self.file, info), scene_dimension(info) or len(self.translate)
         try:
-            self._cloud = _cloud_of(path.absolute(), file_version(path), d, self.velocity, self.scale, self.translate)
+            if None not in (self.frame, self.time):
+                raise flaw("is given as well as frame; leave one of them out", "time")
+            choice = Choice(self.frame, self.time, self.body)
+            version = file_version(path)
+            self._cloud = _cloud_of(path.absolute(), version, d, self.velocity, self.scale, self.translate, choice)
         except GeometryFileError as error:
-            raise flaw(f"{path}: {error}", "file") from None
+            raise flaw(f"{path}: {error}", error.key) from None
         if (self.spacing is None) == (self.total_volume is None):
             places, hint = self._cloud.position, ""
             if len(places) > 1:
@@ -393,6 +519,21 @@ class Points(Table, Solid):
     def file_velocity(self) -> np.ndarray | None:
         """The velocities in the file, (n, d), m/s."""
         return self._cloud.velocity
+
+    @property
+    def state(self) -> ResultState | None:
+        """The state in the file if it is a result of mpmcli."""
+        return self._cloud.state
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Which of several times is read."""
+        return (self._cloud.note,) * bool(self._cloud.note)
+
+    def deformation(self, stores: str, places: np.ndarray) -> np.ndarray | None:
+        """Return J, (n,), or F, (n, d, d), of the points nearest to some places, as a law stores; None if unknown."""
+        found = self.state.fields.get(DEFORMATIONS[stores]) if self.state else None
+        return None if found is None else found[self._cloud.tree.query(places)[1]]
 
     @property
     def volume(self) -> float:
@@ -414,7 +555,9 @@ class Points(Table, Solid):
 
 
 @lru_cache(maxsize=32)
-def _cloud_of(path: Path, version: tuple[int, int], d: int, velocity: Any, scale: float, translate: Any) -> Cloud:
+def _cloud_of(
+    path: Path, version: tuple[int, int], d: int, velocity: Any, scale: float, translate: Any, choice: Choice
+) -> Cloud:
     """Return the points in a file; `version` distinguishes versions of the file."""
-    position, velocities = read_points(path, d, velocity)
-    return Cloud(position * scale + np.array(translate), velocities)
+    position, *found = read_points(path, d, velocity, choice)
+    return Cloud(position * scale + np.array(translate), *found)

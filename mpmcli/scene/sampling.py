@@ -1,8 +1,8 @@
 """Particles of bodies: initial position, velocity and deformation, volume and mass."""
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from itertools import product
 
 import numpy as np
@@ -12,7 +12,7 @@ from mpmcli.scene.domain import Domain
 from mpmcli.scene.entry import Entry, entries_in, value_of, varies
 from mpmcli.scene.expression import INITIAL, Expression, derivative, evaluate
 from mpmcli.scene.fitting import fitted
-from mpmcli.scene.points import Points
+from mpmcli.scene.points import DEFORMATIONS, Points
 from mpmcli.scene.primitives import Box
 from mpmcli.scene.problem import Path, path_text
 from mpmcli.scene.quantity import place_text
@@ -110,6 +110,23 @@ def has_expressions(body: Body) -> bool:
     return moves_unevenly(body) or body.deformation is not None
 
 
+def starts_deformed(body: Body) -> bool:
+    """Return whether a body starts with a deformation, that of the scene or of a result that it goes on from."""
+    form = body.shape.form
+    stored = isinstance(form, Points) and form.deformation(body.material.stores, form.position[:1]) is not None
+    return stored or body.deformation is not None or body.initial_pressure is not None
+
+
+def missing_state(body: Body) -> list[str]:
+    """Return the fields that a result lacks, so that the particles of a body cannot go on as they were."""
+    form, d = body.shape.form, len(body.velocity)
+    if not isinstance(form, Points) or form.state is None:
+        return []
+    wanted = [DEFORMATIONS[body.material.stores], *(one.name for one in body.material.internal_in(d))]
+    wanted += ["affine"] * (form.file_velocity is not None) + ["initial_position"] * body.material.has_surface
+    return [name for name in wanted if name not in form.state.fields]
+
+
 def moves_unevenly(body: Body) -> bool:
     """Return whether the velocity of a body, or its gradient, is an expression."""
     return varies(*body.velocity) or replaces_gradient(body)
@@ -154,7 +171,8 @@ def initial_deformation(body: Body, position: np.ndarray, domain: Domain) -> np.
     if body.initial_pressure == "hydrostatic":
         return body.material.volume_ratio_under(hydrostatic_load(body, position, domain))
     if body.deformation is None:
-        return None
+        form = body.shape.form
+        return form.deformation(body.material.stores, position) if isinstance(form, Points) else None
     if isinstance(body.deformation, tuple):
         return matrix_at(body.deformation, position)
     return _at(body.deformation, position).astype(np.float64)
@@ -168,6 +186,7 @@ def rest_volume(body: Body, domain: Domain) -> float:
     form = body.shape.form
     unknown = body.initial_pressure == "hydrostatic" and getattr(body.material, "bulk_modulus", None) == "auto"
     if unknown or (body.deformation is None and body.initial_pressure != "hydrostatic"):
+        # The volume of particles of a result is that at rest.
         return form.volume
     places = form.position if isinstance(form, Points) else _places_in(form)
     J = initial_deformation(body, places, domain)
@@ -294,6 +313,7 @@ class BodyParticles:
         deformation: J, (n,), or F, (n, d, d), at the start; None where there is none.
         initial: (n, d), the X of expressions, m, if it differs from the position.
         waits: whether they belong to an emitter and enter later.
+        internal: internal variables at the start, (n,), by name, among others; those at rest are missing.
     """
 
     name: str
@@ -305,6 +325,7 @@ class BodyParticles:
     deformation: np.ndarray | None = None
     initial: np.ndarray | None = None
     waits: bool = False
+    internal: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     @property
     def count(self) -> int:
@@ -436,11 +457,14 @@ def _sample(body: Body, index: int, domain: Domain) -> BodyParticles:
     if faults:
         raise InputError("\n".join(faults))
     velocity, affine = initial_motion(body, position)
+    state = form.state.fields if isinstance(form, Points) and form.state else {}
     if isinstance(form, Points) and form.file_velocity is not None:
-        velocity = velocity + form.file_velocity
+        velocity, affine = velocity + form.file_velocity, affine + state.get("affine", 0.0)
     deformation = initial_deformation(body, position, domain)
     volume = rest_volume(body, domain) / len(position)
-    return BodyParticles(body.name, position, velocity, affine, volume, body.material.density * volume, deformation)
+    mass = body.material.density * volume
+    initial = state["initial_position"][:, : position.shape[1]] if "initial_position" in state else None
+    return BodyParticles(body.name, position, velocity, affine, volume, mass, deformation, initial, internal=state)
 
 
 def _generator(body: Body, index: int) -> np.random.Generator:

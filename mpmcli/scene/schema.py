@@ -293,7 +293,7 @@ class Body(Table):
     @property
     def has_surface(self) -> bool:
         """Whether particles can represent its surface: its material keeps one, and its shape is known."""
-        return self.material.has_surface and self.shape.points is None
+        return self.material.has_surface and (self.shape.points is None or self.shape.at_rest is not None)
 
 
 def _no_repeats(fields: tuple[str, ...]) -> tuple[str, ...]:

@@ -8,10 +8,18 @@ from itertools import chain, combinations, islice, product
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import AfterValidator, BeforeValidator, Field, PrivateAttr, ValidationInfo, model_validator
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Field,
+    PrivateAttr,
+    ValidationError,
+    ValidationInfo,
+    model_validator,
+)
 
 from mpmcli.scene.mesh import Mesh, Rotation
-from mpmcli.scene.points import Points
+from mpmcli.scene.points import Points, ResultState
 from mpmcli.scene.primitives import (
     Ball,
     Box,
@@ -329,6 +337,29 @@ class BodyShape(Shape):
     @property
     def files(self) -> list[str]:
         return [self.points.file] if self.points else super().files
+
+    @property
+    def at_rest(self) -> "tuple[Form, np.ndarray] | None":
+        """The form from which the body of a result began, and its particles there, (n, d), m; None if unknown."""
+        state = self.points and self.points.state
+        return _at_rest(state, self.points.position.shape[1]) if state else None
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        return self.points.notes if self.points else super().notes
+
+
+@lru_cache(maxsize=32)
+def _at_rest(state: ResultState, d: int) -> tuple[Form, np.ndarray] | None:
+    """Return `BodyShape.at_rest`, unknown for several bodies and for one that began deformed or as points."""
+    if "initial_position" not in state.fields or "deformation" in state.body:
+        return None
+    try:
+        began = BodyShape.model_validate(state.body.get("shape", {}), context={"dimension": d}).form
+    except (ValidationError, StopIteration):
+        # The file of a shape is gone.
+        return None
+    return None if isinstance(began, Points) else (began, state.fields["initial_position"][:, :d])
 
 
 OneShape = Annotated[BodyShape, AfterValidator(exactly_one_form), Field(json_schema_extra={"minProperties": 1})]

@@ -178,13 +178,16 @@ ASIDE, STEP = 1e-4, 1e-6
 def rest_surface(body: Body, particles: BodyParticles, spacing: float | None) -> np.ndarray:
     """Return the outward unit normal N and the depth D, m, of particles, (n, d + 1).
 
-    The shape of an initially deformed body is the deformed one: N is along F^T n, and D = d / |F^T n|. `spacing` is
-    that of the grid, m; None for a body without a surface, whose particles get the depth BELOW_ALL.
+    The shape of an initially deformed body is the deformed one: N is along F^T n, and D = d / |F^T n|. That of a body
+    of a result is the one from which it began, if known. `spacing` is that of the grid, m; None for a body without a
+    surface, whose particles get the depth BELOW_ALL.
     """
     position, d = particles.position, particles.position.shape[1]
     if spacing is None:
         return np.full((len(position), d + 1), BELOW_ALL)
-    form, distance = body.shape.form, lattice_spacing(body, spacing)
+    form, distance, began = body.shape.form, lattice_spacing(body, spacing), body.shape.at_rest
+    if began:
+        form, position = began
     # Offset away from the centre, so that mirrored bodies have mirrored normals.
     away = np.where(position < np.mean(form.bounds(), axis=0), -1.0, 1.0)
     place = position + ASIDE * distance * away * [1.0, 0.618, 0.414][:d]
@@ -192,7 +195,7 @@ def rest_surface(body: Body, particles: BodyParticles, spacing: float | None) ->
     slope = [form.signed_distance(place + step) - form.signed_distance(place - step) for step in steps]
     normal = np.stack(slope, axis=1)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    if particles.deformation is not None:
+    if particles.deformation is not None and not began:
         normal = np.einsum("pji,pj->pi", particles.deformation, normal)
     size = np.linalg.norm(normal, axis=1)
     depth = np.maximum(-form.signed_distance(position), 0.0)

@@ -46,10 +46,10 @@ def initial_states(
             relative to the first body.
     """
     rest = np.ones(1) if law.deformation == "J" else np.eye(len(origin))[None]
-    at_rest = [float(variable.at_rest) for variable in law.internal]
     before = 0
     for place, (body, first_id, surface) in enumerate(zip(particles, first_ids, surfaces, strict=True)):
         count = len(body.position)
+        internal = [np.broadcast_to(body.internal.get(one.name, one.at_rest), count) for one in law.internal]
         for first in range(0, count, PART):
             own = slice(first, min(first + PART, count))
             n = own.stop - first
@@ -60,7 +60,7 @@ def initial_states(
                 "v": body.velocity[own],
                 "C": body.affine[own],
                 "deformation": np.repeat(rest, n, 0) if body.deformation is None else body.deformation[own],
-                "internal": np.tile(at_rest, (n, 1)),
+                "internal": np.stack([values[own] for values in internal], axis=1) if internal else np.empty((n, 0)),
                 "id": first_id + np.arange(first, own.stop),
                 "activity": 0 if body.waits else 1,
                 "surface": surface[own],
@@ -176,10 +176,10 @@ def groups_of(batch: Batch, slot: int, scene: Scene, particles: Sequence[BodyPar
 
 
 def require_inside(scene: Scene, particles: Sequence[BodyParticles]) -> None:
-    """Raise an InputError for particles outside the domain or at NaN; the sort would count them in missing tiles."""
-    lower, upper = np.array(scene.domain.origin), np.array(scene.domain.upper)
+    """Raise an InputError for particles more than half a cell outside the domain or at NaN, which have no tiles."""
+    lower, upper, half = np.array(scene.domain.origin), np.array(scene.domain.upper), scene.domain.spacing / 2
     for sample in particles:
-        inside = ((sample.position >= lower) & (sample.position <= upper)).all(axis=1)
+        inside = ((sample.position >= lower - half) & (sample.position <= upper + half)).all(axis=1)
         if not inside.all():
             p = int(np.argmin(inside))
             place, low, high = (", ".join(f"{x:.6g}" for x in point) for point in (sample.position[p], lower, upper))
