@@ -16,6 +16,7 @@ from mpmcli.materials.registry import parameter_models
 from mpmcli.output import open_result
 from mpmcli.scene import Scene, estimate_particles, highest_speed, parse_scene, sample_bodies
 from mpmcli.scene.points import read_points
+from mpmcli.solver.engine.run_group import require_inside
 
 RANDOM = np.random.default_rng(3)
 POINTS = {d: RANDOM.uniform(0.1, 0.9, (50, d)) for d in (2, 3)}
@@ -246,6 +247,20 @@ def test_what_a_result_does_not_have_is_one_sentence(result: Path, keys: dict, s
     with pytest.raises(InputError) as refused:
         scene_of(result, table)
     assert sentence.format(result / "run" / "particles.vtkhdf") in str(refused.value)
+
+
+@pytest.mark.parametrize(("out", "word", "fits"), [(0.4, "slip", True), (0.6, "slip", False), (1.9, "open", True)])
+def test_particles_of_a_result_may_be_beyond_faces(tmp_path: Path, out: float, word: str, fits: bool) -> None:
+    """By half a cell where they overlap a wall, and by two where they have yet to be retired at an open face."""
+    write_result(tmp_path / "run", header((1.0, 1.0), 0.1, [WATER]), [frame(0, [[0.5, 0.5], [1.0 + 0.1 * out, 0.5]])])
+    data = scene_data({"file": "run/particles.vtkhdf", "spacing": 0.05})
+    data["domain"]["walls"] = {"default": "slip", "x_max": word}
+    if fits:
+        scene = parse_scene(data, laws=parameter_models(), directory=tmp_path).scene
+        require_inside(scene, sample_bodies(scene))
+    else:
+        with pytest.raises(InputError, match="leaves the domain through x_max"):
+            parse_scene(data, laws=parameter_models(), directory=tmp_path)
 
 
 def test_a_file_of_one_time_has_no_frames(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from mpmcli.scene.bounds import body_places
 from mpmcli.scene.colliders import Collider, Plane, has_jump, slope_of
-from mpmcli.scene.domain import SEPARATING, STICKING
+from mpmcli.scene.domain import OPEN, SEPARATING, STICKING
 from mpmcli.scene.entry import entries_in, tree_of, value_of, varies
 from mpmcli.scene.expression import Expression
 from mpmcli.scene.mesh import Mesh, leaving, moved_inside
@@ -103,8 +103,8 @@ def _emitted(emitter: Emitter, scene: Scene) -> Iterator[tuple[str, str]]:
         times = np.array([emitter.start, *telling_times(tree_of(emitter.rate), emitter.start, until)])
         rates = np.broadcast_to(value_of(emitter.rate, t=times), times.shape)
         if not (rates >= 0).all() or not rates.any():
-            t = times[np.argmax(~(rates >= 0))]
-            found = "nothing flows" if not rates.any() else f"at t = {t:.4g} s it is {rates[times == t][0]:.4g}"
+            k = np.argmax(~(rates >= 0))
+            found = "nothing flows" if not rates.any() else f"at t = {times[k]:.4g} s it is {rates[k]:.4g}"
             yield "rate", f"must not be negative, and positive at some time: {found}"
             return
     sheets = sheets_of(emitter, scene)
@@ -254,21 +254,22 @@ def _repeated_names(scene: Scene) -> Iterator[Problem]:
 
 
 def _outside(scene: Scene) -> Iterator[Problem]:
-    domain = scene.domain
+    domain, words = scene.domain, scene.domain.walls.faces(scene.dimension)
     for i, body in enumerate(scene.bodies):
         form = body.shape.form
-        # The particles of a result may overlap walls by half a cell.
-        tolerance = (0.5 if isinstance(form, Points) and form.state else _TOLERANCE) * domain.spacing
+        goes_on = isinstance(form, Points) and form.state
         lower, upper = form.bounds()
         faces = []
         for k, axis in enumerate(AXES[: scene.dimension]):
+            # The particles of a result may overlap walls by half a cell, and be two cells beyond open faces.
+            low, high = ((2.0 if word == OPEN else 0.5) if goes_on else _TOLERANCE for word in words[k])
             start, end = domain.origin[k], domain.upper[k]
-            faces.append((f"{axis}_min", start - lower[k], lower[k], start))
-            faces.append((f"{axis}_max", upper[k] - end, upper[k], end))
+            faces.append((f"{axis}_min", start - lower[k], lower[k], start, low))
+            faces.append((f"{axis}_max", upper[k] - end, upper[k], end, high))
         said = [
             f"{face} by {out:.6g} m (it reaches {face[0]} = {reach:.6g}, the face is at {wall:.6g})"
-            for face, out, reach, wall in faces
-            if out > tolerance
+            for face, out, reach, wall, margin in faces
+            if out > margin * domain.spacing
         ]
         if said:
             ways = " and ".join(said)

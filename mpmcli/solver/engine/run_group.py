@@ -176,10 +176,10 @@ def groups_of(batch: Batch, slot: int, scene: Scene, particles: Sequence[BodyPar
 
 
 def require_inside(scene: Scene, particles: Sequence[BodyParticles]) -> None:
-    """Raise an InputError for particles more than half a cell outside the domain or at NaN, which have no tiles."""
-    lower, upper, half = np.array(scene.domain.origin), np.array(scene.domain.upper), scene.domain.spacing / 2
+    """Raise an InputError for particles more than two cells outside the domain or at NaN, which have no tiles."""
+    lower, upper, margin = np.array(scene.domain.origin), np.array(scene.domain.upper), 2 * scene.domain.spacing
     for sample in particles:
-        inside = ((sample.position >= lower - half) & (sample.position <= upper + half)).all(axis=1)
+        inside = ((sample.position >= lower - margin) & (sample.position <= upper + margin)).all(axis=1)
         if not inside.all():
             p = int(np.argmin(inside))
             place, low, high = (", ".join(f"{x:.6g}" for x in point) for point in (sample.position[p], lower, upper))
