@@ -25,6 +25,7 @@ from mpmcli.stability.transfer_factors import FARTHEST, INTERVAL
 
 # Times of a run at which gravity is evaluated for its mean.
 MOMENTS = 1001
+_GRAVITY = TypeAdapter(TimeVector)
 _DEFAULTS = {name: field.default for name, field in SolverSettings.model_fields.items()}
 
 
@@ -389,7 +390,7 @@ class RunHeader:
 def _mean_gravity(scene: _StoredScene, d: int) -> np.ndarray:
     """Return the mean of gravity over a run, (d,), m/s^2."""
     context = {"dimension": d, "constants": definitions(scene.constants, d)[0]}
-    entries = TypeAdapter(TimeVector).validate_python(list(scene.domain.gravity), context=context)
+    entries = _GRAVITY.validate_python(list(scene.domain.gravity), context=context)
     times = np.linspace(0.0, scene.time.end or 0.0, MOMENTS)
     return np.array([np.nan_to_num(value_of(entry, t=times)).mean() for entry in entries])
 
