@@ -135,3 +135,29 @@ def test_colliders_need_names_of_their_own_and_solids_that_know_them() -> None:
         scene({"name": "one"}, {"name": "one"})
     with pytest.raises(InputError, match='"total" supports walls and colliders that hold'):
         scene({}, solver={"solids": "total"})
+
+
+@pytest.mark.parametrize(
+    ("dimension", "table", "fault"),
+    [
+        (2, {"angular_velocity": [0, 0, 1]}, "colliders turn in their plane in this 2D scene"),
+        (3, {"angular_velocity": [0, 0, 1]}, r"that about the key axis, such as axis = \[0, 0, 1\]; found \[0, 0, 1\]"),
+        (3, {"angle": ["90*t", 0, 0]}, "angle: must be one number or expression: that about the key axis"),
+    ],
+)
+def test_a_rate_that_is_a_vector_names_the_axis(dimension: int, table: dict, fault: str) -> None:
+    shape = {"ball": {"center": [0.5] * dimension, "radius": 0.1}}
+    with pytest.raises(InputError, match=fault):
+        scene({"shape": shape} | table, dimension=dimension)
+
+
+@pytest.mark.parametrize(
+    ("joint", "keys"),
+    [
+        ({"type": "hinge"}, "axis, motor, point, strength and type"),
+        ({"type": "slider", "axis": [0, 1]}, "axis, motor, strength and type"),
+    ],
+)
+def test_an_unknown_key_of_a_joint_is_answered_by_those_of_its_type(joint: dict, keys: str) -> None:
+    with pytest.raises(InputError, match=f"speed: unknown key; the keys here are {keys}$"):
+        scene({"density": 100.0, "joint": joint | {"speed": 3}})

@@ -1,11 +1,16 @@
 """Bad scenes, each with its sentence: file, line, key path, what is wrong, what would be right."""
 
-from typing import get_args
+import tomllib
+from collections.abc import Iterator
+from typing import Any, get_args
 
 import pytest
 from good_scene import GOOD, refusal
 
+from mpmcli.errors import InputError
 from mpmcli.materials.registry import parameter_models
+from mpmcli.scene import parse_scene
+from mpmcli.scene.examples import examples
 from mpmcli.scene.problem import listed, quoted
 from mpmcli.scene.schema import ParticleField
 
@@ -246,6 +251,34 @@ REPLACED = [
         "12:18: not valid TOML: expected a key; a table in { } stands on one line",
     ),
     ("spacing = 0.02", "spacing 0.02", "4:9: not valid TOML: expected key = value"),
+    (
+        '[[bodies]]\nname = "drop"',
+        '[bodies]\nname = "drop"',
+        "13:8: not valid TOML: [bodies] and [[bodies]] are both given; write [[bodies]] for each entry",
+    ),
+    (
+        '[[bodies]]\nname = "column"',
+        '[bodies]\nname = "column"',
+        "13:9: not valid TOML: [bodies] and [[bodies]] are both given; write [[bodies]] for each entry",
+    ),
+    (
+        "[time]",
+        "[[domain]]\n[time]",
+        "6:9: not valid TOML: [domain] and [[domain]] are both given; write [domain] once",
+    ),
+    ("[time]", "[domain]\n[time]", "6:8: not valid TOML: domain is given twice"),
+    ("[time]", "[[time]]", "6: time: must be one table: write [time] or time = { ... }; found a list"),
+    (
+        "[time]",
+        '[colliders]\nname = "a"\n[time]',
+        "6: colliders: must be a list of tables: write [[colliders]] for each entry; found a table with name",
+    ),
+    (
+        'law = "neo_hookean"',
+        'law = "sand"\nfriction_angle = 0',
+        "18: bodies[1].material.friction_angle: must be greater than 0; for a material without friction take "
+        'law = "von_mises" with a yield_stress of 1.73 times its cohesion; found 0',
+    ),
 ]
 
 
@@ -253,3 +286,28 @@ REPLACED = [
 def test_each_bad_scene_has_its_sentence(good, bad, line):
     assert good in GOOD
     assert refusal(GOOD.replace(good, bad)) == [f"scene.toml:{line}"]
+
+
+def tables_in(tree: Any) -> Iterator[dict]:
+    """Yield each table of parsed TOML."""
+    if isinstance(tree, dict):
+        yield tree
+    for inner in tree.values() if isinstance(tree, dict) else tree if isinstance(tree, list) else ():
+        yield from tables_in(inner)
+
+
+@pytest.mark.parametrize("name", ["paddle_wheel_2d", "shaken_tank_2d", "fountain_2d", "jelly_stack_3d"])
+def test_an_unknown_key_of_any_table_is_answered_by_the_known_ones(name: str) -> None:
+    """In all tables of some examples but [constants], which takes any key, and materials, which name parameters."""
+    path = examples()[name]
+    data = tomllib.loads(path.read_text(encoding="utf-8"))
+    for table in tables_in(data):
+        if table is data.get("constants"):
+            continue
+        table["qqqq"] = 1
+        with pytest.raises(InputError) as refused:
+            parse_scene(data, laws=parameter_models(), directory=path.parent)
+        del table["qqqq"]
+        (line,) = str(refused.value).splitlines()
+        assert "the keys here are " in line or "its parameters are " in line or "has no parameter" in line
+        assert line[-1].isalnum()

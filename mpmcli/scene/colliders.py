@@ -5,18 +5,30 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, Field, PrivateAttr, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, PrivateAttr, ValidationInfo, model_validator
 
 from mpmcli.scene.domain import Domain
 from mpmcli.scene.entry import Entry, OfTime, TimeVector, tree_of, varies
 from mpmcli.scene.expression import Apply, Expression, Name, Tree, apply, derivative, evaluate
 from mpmcli.scene.expression import Number as Constant
 from mpmcli.scene.primitives import rotation, unit
+from mpmcli.scene.problem import written
 from mpmcli.scene.quadrature import integral_of, largest_of
-from mpmcli.scene.quantity import NAME, NotNegative, Number, Positive, Table, Vector, direction_as, flaw, list_of_axes
+from mpmcli.scene.quantity import (
+    NAME,
+    NotNegative,
+    Number,
+    Positive,
+    Table,
+    Vector,
+    direction_as,
+    flaw,
+    list_of_axes,
+    scene_dimension,
+)
 from mpmcli.scene.rigid import Fixed, Hinge, Joint, Moments, Path, Posed, SpinAxis, Z, moments_of, turned_by, ways_of
 from mpmcli.scene.shapes import Form, Shape, exactly_one_form
 
@@ -146,6 +158,19 @@ OneColliderShape = Annotated[
 ]
 
 
+def _of_one_axis(value: Any, info: ValidationInfo) -> Any:
+    if not isinstance(value, list | tuple):
+        return value
+    about = "colliders turn in their plane in this 2D scene"
+    if scene_dimension(info) == 3:
+        about = "that about the key axis, such as axis = [0, 0, 1]"
+    raise flaw(f"must be one number or expression: {about}; found {written(value)}")
+
+
+# An angle, or a rate of rotation.
+Turn = Annotated[OfTime, BeforeValidator(_of_one_axis)]
+
+
 class Keyframe(Table):
     """Position and angle of a collider at a time."""
 
@@ -177,11 +202,11 @@ class Collider(Table):
         validate_default=True,
         description="Velocity, m/s; numbers, or expressions of the time t (s). Default: at rest.",
     )
-    angular_velocity: OfTime = Field(0.0, description="Rate of rotation about its axis, rad/s.")
+    angular_velocity: Turn = Field(0.0, description="Rate of rotation about its axis, rad/s.")
     offset: list_of_axes(OfTime) | None = Field(
         None, description="Offset from where its shape stands, m, in place of the velocity. Default: none."
     )
-    angle: OfTime | None = Field(
+    angle: Turn | None = Field(
         None, description="Angle that it is turned by, rad, in place of the rate. Default: none."
     )
     keyframes: tuple[Keyframe, ...] = Field(

@@ -189,6 +189,12 @@ def _problem(path: Path, errors: list[Any], model: type[BaseModel]) -> Problem:
         case "union_tag_invalid":
             known = ctx["expected_tags"].replace("'", '"').replace(", ", " or ")
             return Problem((*path, ctx["discriminator"].strip("'")), f"must be {known}; found {written(ctx['tag'])}")
+        case "tuple_type" | "list_type" if isinstance(value, dict) and any(_tables_at(model, first["loc"])):
+            name = path_text(tuple(part for part in path if isinstance(part, str)))
+            return Problem(path, f"must be a list of tables: write [[{name}]] for each entry; found {written(value)}")
+        case "model_type" | "model_attributes_type" if isinstance(value, list):
+            name = path_text(tuple(part for part in path if isinstance(part, str)))
+            return Problem(path, f"must be one table: write [{name}] or {path[-1]} = {{ ... }}; found a list")
     return Problem(path, _wrong_value(errors, value))
 
 
@@ -249,7 +255,7 @@ def _tables_at(model: type[BaseModel], loc: Path) -> list[type[BaseModel]]:
             for inner in _models_in(table.model_fields[part].annotation)
         ]
         # A part that is not a key is the tag of a union and selects one of its members.
-        tagged = [t for t in tables if "law" in t.model_fields and t.model_fields["law"].default == part]
+        tagged = [t for t in tables if any(get_args(one.annotation) == (part,) for one in t.model_fields.values())]
         tables = deeper or tagged
     return tables
 

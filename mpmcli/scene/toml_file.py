@@ -6,7 +6,7 @@ from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from os import PathLike
 from pathlib import Path as File
-from typing import Any
+from typing import Any, get_origin
 
 import tomli_w
 
@@ -43,6 +43,7 @@ def too_deep(tree: Any) -> bool:
 
 
 _POSITION = re.compile(r" \(at (?:line (\d+), column (\d+)|end of document)\)$")
+_HEADER = re.compile(r"^[ \t]*\[\[?[ \t]*([\w.-]+)[ \t]*\]", re.MULTILINE)
 # Messages of tomllib, and the plainer sentences that replace them.
 _SYNTAX = {
     "Cannot overwrite a value": "this key is given twice",
@@ -93,16 +94,28 @@ def _parse(text: str, source: str) -> dict[str, Any]:
         if not too_deep(found):
             return found
     except tomllib.TOMLDecodeError as error:
-        said = str(error)
-        place = source
+        said, place = str(error), source
         if position := _POSITION.search(said):
             said = said[: position.start()]
             line, column = position.groups() if position[1] else (max(1, len(text.splitlines())), None)
             place += f":{line}" + (f":{column}" if column else "")
+            if said.startswith("Cannot") and (header := _HEADER.match(text.splitlines()[int(line) - 1])):
+                said = _given_twice(header[1], text)
         raise InputError(f"{place}: not valid TOML: {_SYNTAX.get(said, said[:1].lower() + said[1:])}") from None
     except (ValueError, RecursionError):
         pass
     raise InputError(f"{source}: not valid TOML: a number is too long or lists are too deep")
+
+
+def _given_twice(name: str, text: str) -> str:
+    """Return the fault of a header [name] or [[name]] that stands in a text before."""
+    if len({match[0].count("[") for match in _HEADER.finditer(text) if match[1] == name}) == 1:
+        return f"{name} is given twice"
+    field = Scene.model_fields.get(name)
+    right = f"[{name}] for a table, [[{name}]] for each entry of a list"
+    if field:
+        right = f"[[{name}]] for each entry" if get_origin(field.annotation) is tuple else f"[{name}] once"
+    return f"[{name}] and [[{name}]] are both given; write {right}"
 
 
 _BLANK = re.compile(r"[ \t]*")
