@@ -13,10 +13,12 @@ from mpmcli.check.facts import SceneFacts
 from mpmcli.check.finding import SEVERITIES
 from mpmcli.check.scene_check import check_scene
 from mpmcli.check.step_rules import HALF_ULP, LOST_MOTION, STRESS_NOISE
+from mpmcli.check.unit_rules import unit_findings
 from mpmcli.errors import InputError
 from mpmcli.materials.fluid import Fluid
-from mpmcli.materials.registry import laws
-from mpmcli.scene import LoadedScene
+from mpmcli.materials.registry import laws, parameter_models
+from mpmcli.scene import LoadedScene, load_scene
+from mpmcli.scene.examples import examples
 from mpmcli.scene.problem import listed, quoted
 
 H = 1 / 64
@@ -512,6 +514,71 @@ def test_numbers_in_other_units_or_of_another_kind(rule: str, said: dict, other:
     (finding,) = found(rule, **said)
     assert finding.severity == ("note" if rule in ("low-heap", "large-domain", "welds") else "warning")
     assert found(rule, **other) == []
+
+
+PART = {"name": "part", "shape": box([0.6, 0.1], [0.8, 0.3])}
+TURNED = {"keyframes": [{"time": 0.0}, {"time": 5.0, "angle": 90.0}]}
+WEAK = SOLID | {"youngs_modulus": 200.0}
+RIGID = PART | {"density": 500.0}
+TILTED = box([0.25, 0.2], [0.5, 0.45])
+
+
+@pytest.mark.parametrize(
+    ("said", "right", "other"),
+    [
+        ({"material": SOLID | {"density": 7.8}}, "7.8 g/cm^3 are 7800", {"material": SOLID | {"density": 30.0}}),
+        ({"material": FLUID | {"density": 0.5}}, "0.5 g/cm^3 are 500", {}),
+        ({"colliders": [PART | {"density": 0.8}]}, "0.8 g/cm^3 are 800", {"colliders": [RIGID]}),
+        # The other one is a gel that nothing loads.
+        ({"material": WEAK}, "200 GPa 2e+11", {"material": WEAK, "domain": {"gravity": [0.0, -0.1]}}),
+        ({"material": SOLID | {"youngs_modulus": 0.015}}, "0.015 MPa are 1.5e+04", {"material": SOLID}),
+        ({"material": FLUID | {"bulk_modulus": 2.2}}, "2.2 GPa 2.2e+09", {}),
+        (
+            {"colliders": [PART | {"angular_velocity": 90.0}]},
+            "1.571",
+            {"colliders": [PART | {"angular_velocity": 6.0}]},
+        ),
+        ({"colliders": [PART | {"angle": "90*t"}]}, "1.571", {"colliders": [PART | {"angle": "0.05*sin(1000*t)"}]}),
+        ({"colliders": [PART | {"angle": 45.0}]}, "45 degrees are 0.7854", {"colliders": [PART | {"angle": 0.7854}]}),
+        ({"colliders": [PART | TURNED]}, "90 degrees are 1.571", {}),
+        (
+            {"colliders": [RIGID | {"joint": {"type": "hinge", "motor": 90.0}}]},
+            "1.571",
+            {"colliders": [RIGID | {"joint": {"type": "hinge", "motor": 9.0}}]},
+        ),
+        # The other one rolls.
+        (
+            {"colliders": [RIGID | {"angular_velocity": 40.0}]},
+            "40 degrees",
+            {"colliders": [RIGID | {"angular_velocity": 40.0, "velocity": [4.0, 0.0]}]},
+        ),
+        *(
+            ({"shape": TILTED | {"rotation": angle}}, f"{angle:.4g} rad are {degrees}", {})
+            for angle, degrees in ((0.5, "28.65"), (1.57, "89.95"), (-1.0472, "-60"))
+        ),
+        (
+            {"colliders": [PART | {"shape": PART["shape"] | {"rotation": 0.785}}]},
+            "0.785 rad are 44.98",
+            {"colliders": [PART | {"shape": PART["shape"] | {"rotation": 2.5}}]},
+        ),
+    ],
+)
+def test_numbers_that_may_be_in_other_units_are_asked_about(said: dict, right: str, other: dict) -> None:
+    """Densities in g/cm^3, moduli in MPa, angles of a motion in degrees, rotations of a shape in radians."""
+    (finding,) = found("units", **said)
+    assert finding.severity == "note" and right in finding.fix
+    assert found("units", **other) == []
+
+
+def test_no_example_is_asked_about_its_units() -> None:
+    scenes = (load_scene(path, laws=parameter_models()) for path in examples().values())
+    assert [one for loaded in scenes for one in unit_findings(SceneFacts(loaded.scene)) if one.rule == "units"] == []
+
+
+def test_cohesion_alone_is_another_law() -> None:
+    """Below 5 degrees: von Mises, whose strength in simple shear is its yield stress over sqrt(3)."""
+    (finding,) = found("friction-angle", material=SAND | {"friction_angle": 1.0, "cohesion": 5000.0})
+    assert "yield_stress = 8660" in finding.fix
 
 
 def test_hydrostatic_pressure_is_not_advised_where_it_is_refused() -> None:

@@ -7,8 +7,16 @@ import numpy as np
 
 from mpmcli.check.facts import SceneFacts
 from mpmcli.check.finding import Finding
+from mpmcli.check.scene_limits import law_of
+from mpmcli.check.shape_rules import INSTANTS
+from mpmcli.scene.colliders import Collider
+from mpmcli.scene.entry import tree_of
+from mpmcli.scene.mesh import Rotation
 from mpmcli.scene.problem import quoted, several
+from mpmcli.scene.quadrature import largest_of
 from mpmcli.scene.quantity import AXES
+from mpmcli.scene.rigid import Hinge
+from mpmcli.scene.shapes import Shape
 
 # Gravity, m/s^2, in whose range it is that of the earth in cm/s^2, and in mm/s^2.
 CENTIMETRES, MILLIMETRES = (900.0, 1100.0), (9000.0, 11000.0)
@@ -16,13 +24,20 @@ CENTIMETRES, MILLIMETRES = (900.0, 1100.0), (9000.0, 11000.0)
 ROUGH, SMOOTH = 2.0, 5.0
 # Share of the domain that bodies fill, and number of its cells, below and above which it is much too large.
 SPARSE, MANY = 0.01, 100_000
+# Density, kg/m^3, below which a material is a gas or a foam; modulus, Pa, below which and share of the load on it below
+# which it is probably not in Pa.
+LIGHT, WEAK, LOADED = 25.0, 2e3, 0.1
+# Rate of rotation, rad/s, from which on it may be meant in degrees; a part of a turn that is an angle in radians, to
+# this share of itself.
+FAST, PART, NEAR = 30.0, math.pi / 12, 5e-3
 # Cells over the height of a heap of sand that resolve its slope.
 HEAP = 8.0
 
 
 def unit_findings(facts: SceneFacts) -> Iterator[Finding]:
     """Yield the findings on numbers that look wrong."""
-    for rule in (_gravity, _friction, _angle, _room, _heap, _welds, _restitution):
+    units = (_gravity, _density, _modulus, _turns, _rotations)
+    for rule in (*units, _friction, _angle, _room, _heap, _welds, _restitution):
         yield from rule(facts)
 
 
@@ -38,6 +53,80 @@ def _gravity(facts: SceneFacts) -> Iterator[Finding]:
     if domain.steady and gravity[-1] > 0.5 * size:
         what = f"Gravity points along +{up}, which is up in pictures: bodies rise."
         yield Finding("warning", "gravity-up", what, f"Give the {up} component a minus sign if they should fall.", size)
+
+
+def _density(facts: SceneFacts) -> Iterator[Finding]:
+    """Yield densities that may be in g/cm^3."""
+    found = {one.name: one.material.density for one in facts.scene.sources}
+    found |= {one.name: one.density for one in facts.scene.colliders if one.density}
+    for name, density in found.items():
+        if density < LIGHT:
+            what = f'The density of "{name}" is {density:.4g} kg/m^3, that of a gas or a foam.'
+            fix = f"Give it in kg/m^3: {density:.4g} g/cm^3 are {1000 * density:.4g}."
+            yield Finding("note", "units", what, fix, density, name)
+
+
+def _modulus(facts: SceneFacts) -> Iterator[Finding]:
+    """Yield moduli far below the pressures of the scene, which may be in kPa, MPa or GPa."""
+    bounds = facts.bounds
+    for source in facts.scene.sources:
+        law = law_of(source, facts.scene.dimension)
+        name, modulus = law.first_set(source.material, law.stiffness_parameters) or ("", math.inf)
+        load = source.material.density * max(bounds.gravity * bounds.height, bounds.speed**2)
+        if modulus < min(WEAK, LOADED * load):
+            what = f'The {name} of "{source.name}" is {modulus:.4g} Pa, in a scene with pressures up to {load:.2g} Pa.'
+            fix = f"Give it in Pa: {modulus:.4g} MPa are {1e6 * modulus:.4g}, {modulus:.4g} GPa {1e9 * modulus:.4g}."
+            yield Finding("note", "units", what, fix, modulus, source.name)
+
+
+def _turns(facts: SceneFacts) -> Iterator[Finding]:
+    """Yield rates of rotation and angles of colliders that may be in degrees."""
+    end = facts.scene.time.end
+    for one in facts.scene.colliders:
+        rates = [tree_of(one.angular_velocity) if one.free else one.motion.spin]
+        rates += [tree_of(one.joint.motor)] if isinstance(one.joint, Hinge) and one.joint.motor is not None else []
+        rate = max(largest_of(tree, 0.0, end) for tree in rates)
+        if rate >= FAST and (_spins if one.free else _goes_round)(one, rate, end):
+            what = f'Collider "{one.name}" turns at up to {rate:.4g} rad/s, {rate / math.tau:.3g} turns in a second.'
+            fix = f"Rates are in rad/s: {rate:.4g} degrees in a second are {math.radians(rate):.4g}."
+            yield Finding("note", "units", what, fix, rate, one.name)
+            continue
+        angle = max(abs(key) for key in (one.motion.angle, *(key.angle for key in one.keyframes)))
+        if angle > math.tau and angle == round(angle):
+            what = f'Collider "{one.name}" is turned by {angle:g} rad, {angle / math.tau:.3g} turns.'
+            fix = f"Angles of a motion are in rad: {angle:g} degrees are {math.radians(angle):.4g}."
+            yield Finding("note", "units", what, fix, angle, one.name)
+
+
+def _spins(one: Collider, rate: float, end: float) -> bool:
+    """Return whether a rigid body turns by itself, faster than it would roll."""
+    return rate * one.radius > 2 * float(np.linalg.norm(one.velocity))
+
+
+def _goes_round(one: Collider, rate: float, end: float) -> bool:
+    """Return whether a collider turns by more than a vibration does, a full turn."""
+    angles = [one.motion.at(time)[1] for time in np.linspace(0.0, end, INSTANTS)]
+    return float(np.ptp(angles)) > math.tau
+
+
+def _rotations(facts: SceneFacts) -> Iterator[Finding]:
+    """Yield rotations of shapes that may be in radians."""
+    for one in (*facts.scene.sources, *facts.scene.colliders):
+        for angle in _angles_of(one.shape):
+            parts = abs(angle) / PART
+            if 0 < abs(angle) < 1 or (parts < 25 and angle % 1 and abs(parts - round(parts)) < NEAR * parts):
+                what = f'The shape of "{one.name}" is rotated by {angle:.4g} degrees.'
+                fix = f"Rotations of shapes are in degrees: {angle:.4g} rad are {math.degrees(angle):.4g}."
+                yield Finding("note", "units", what, fix, angle, one.name)
+
+
+def _angles_of(shape: Shape) -> Iterator[float]:
+    """Yield the angles, degrees, by which a shape and its parts are rotated."""
+    for rotated in (shape.rotation, shape.mesh and shape.mesh.rotate):
+        if rotated is not None:
+            yield rotated.angle if isinstance(rotated, Rotation) else rotated
+    for part in (*(shape.add or ()), *(shape.subtract or ())):
+        yield from _angles_of(part)
 
 
 def _friction(facts: SceneFacts) -> Iterator[Finding]:
@@ -63,7 +152,10 @@ def _angle(facts: SceneFacts) -> Iterator[Finding]:
         if angle is not None and 0 < angle < SMOOTH:
             what = f'The friction angle of body "{body.name}" is {angle:.3g} degrees: it flows almost as a liquid.'
             fix = "Give it in degrees, for dry sand about 30."
-            if angle < math.pi / 2:
+            if cohesion := getattr(body.body.material, "cohesion", 0.0):
+                what = f'The friction angle of body "{body.name}" is {angle:.3g} degrees: its cohesion alone holds it.'
+                fix = f'For that take law = "von_mises" with yield_stress = {math.sqrt(3) * cohesion:.4g}.'
+            elif angle < math.pi / 2:
                 fix = f"In degrees, {angle:.3g} rad are {math.degrees(angle):.3g}."
             yield Finding("warning", "friction-angle", what, fix, angle, body.name)
 
