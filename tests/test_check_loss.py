@@ -9,11 +9,12 @@ import pytest
 from check_scenes import FLUID, SOLID, box, found, loaded
 from solver_state import scene_of
 
+from mpmcli.check import step_rules
 from mpmcli.check.facts import SceneFacts
 from mpmcli.check.finding import Finding
 from mpmcli.check.forecast import expected_steps
 from mpmcli.check.scene_check import check_scene
-from mpmcli.check.step_rules import NOTED_SHARE, chord, flow_width
+from mpmcli.check.step_rules import NOTED_LOSS, chord, flow_width
 from mpmcli.scene import LoadedScene, Scene
 from mpmcli.scene.forces import Contact
 from mpmcli.scene.schema import USUAL_FLIP, SolverSettings
@@ -74,6 +75,11 @@ def bars(cells: int, safety: float, speed: float, *, free: bool = False, **more:
         ],
         solver={"precision": "f64"} | more,
     )
+
+
+@pytest.fixture(autouse=True)
+def _small_losses_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(step_rules, "NOTED_LOSS", 0.02)
 
 
 def told(scene: Scene, rule: str) -> list[Finding]:
@@ -194,7 +200,7 @@ def test_the_law_of_the_loss_in_an_impact() -> None:
     assert impact_loss(usual, 1000, 0.0025, 0.8) == pytest.approx(2 * small, rel=1e-2)
     assert impact_loss(usual, 1000, 1e-9, 0.8) == impact_loss(usual, 1000, 0.0, 0.8) < 12 * small
     assert impact_loss(SolverSettings(transfer="aflip", flip=0.95), 1000, 0.01, 0.8) < 0.13 * small
-    assert small < NOTED_SHARE
+    assert small < NOTED_LOSS
 
 
 def test_the_mean_length_of_a_shape() -> None:

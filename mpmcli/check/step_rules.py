@@ -33,12 +33,10 @@ CONSEQUENCE = {
     "deformation": "particles are inverted",
     "collider": "colliders pass the material by",
 }
-# Fractions of energy lost by a wave in the run, and dissipated by viscosity, above which they matter.
+# Fraction of the energy of a wave or an impact, or of the given viscosity, from which on the scheme's loss is reported.
 NOTED_LOSS = 0.1
-# Fraction of energy that is all of it in a message.
-ALL = 0.995
-# Fraction of the given viscosity, or of the energy of an impact, above which the scheme's own loss is reported.
-NOTED_SHARE = 0.02
+# Fraction of a loss that a remedy leaves at most.
+REMEDIED = 0.5
 # Largest relative rounding error of a number of 32 bits.
 HALF_ULP = 2.0**-24
 # Rounding of a position in a frame over the displacement of its body in the run. A step loses nothing: particles carry
@@ -127,20 +125,17 @@ def _dissipation(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
         length, extent = float(np.ptp(body.body.shape.form.bounds(), axis=0).max()), "long"
     rate = wave_loss(length, h, step, facts.scene.solver)
     lost = -math.expm1(-rate * end)
-    if lost < NOTED_LOSS or body.own_loss > rate:
+    # A wave loses an eighth: a sixteenth in each of twice as many steps.
+    finer, locks = -math.expm1(-rate * end / 8), getattr(body.body.material, "poissons_ratio", 0.0) > LOCKING
+    cures = [f"Half the spacing lowers that to {_percent(finer)} in the run."] * (finer <= REMEDIED * lost)
+    cures += [f"Longer steps with poissons_ratio = {LOCKING:g} or less lower it."] * locks
+    if lost < NOTED_LOSS or body.own_loss > rate or not cures:
         return
     what = (
         f"At a step of {step:.3g} s the transfers take {_percent(-math.expm1(-rate))} of the energy of a wave across "
         f'body "{body.name}", {length / h:.3g} cells {extent}, in a second, and {_percent(lost)} in the run.'
     )
-    # A wave loses an eighth: a sixteenth in each of twice as many steps.
-    finer = -math.expm1(-rate * end / 8)
-    fix = f"Half the spacing lowers that to {_percent(finer)} in the run"
-    if finer > ALL:
-        fix = "Where waves across it matter, refine the domain"
-    if getattr(body.body.material, "poissons_ratio", 0.0) > LOCKING:
-        fix += f", and longer steps with poissons_ratio = {LOCKING:g} or less lower it as well"
-    yield Finding("note", "dissipation", what, f"{fix}.", rate, body.name)
+    yield Finding("note", "dissipation", what, " ".join(cures), rate, body.name)
 
 
 def _viscosity(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
@@ -161,7 +156,7 @@ def _viscosity(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
 
     h = scene.domain.spacing
     added = share(scene.solver, h, step)
-    if not added >= NOTED_SHARE:
+    if not added >= NOTED_LOSS:
         return
     # Half the spacing permits half the step for waves, a quarter for viscosity.
     finer = share(scene.solver, h / 2, step / (4 if facts.binding.name == "viscosity" else 2))
@@ -197,7 +192,7 @@ def _impact(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
         return share * impact_loss(settings, length / spacing, mach, courant, surfaces=surfaces)
 
     now = lost(scene.solver, h)
-    if not now >= NOTED_SHARE:
+    if not now >= NOTED_LOSS:
         return
     takers = "contact and the transfers" if surfaces else f"the transfers, at steps of {courant * h / waves:.3g} s"
     what = (
