@@ -617,6 +617,17 @@ DRUM = {"name": "drum", "side": "inside", "shape": {"ball": {"center": [0.5, 0.5
         ("impact-loss", {}, {"colliders": [GRIP]}),
         # Sand above a slippery floor, and in a drum.
         ("slippery", {"material": GRAINS}, {"material": GRAINS, "colliders": [DRUM]}),
+        # Beside a ramp, and above one that covers the floor; through a gap, and above a thin plate.
+        (
+            "slippery",
+            {"material": GRAINS, "colliders": [{"name": "ramp", "shape": box([0.4, 0.0], [1.0, 0.1])}]},
+            {"material": GRAINS, "colliders": [{"name": "ramp", "shape": box([0.0, 0.0], [1.0, 0.1])}]},
+        ),
+        (
+            "slippery",
+            {"material": GRAINS, "colliders": [{"name": "grip", "wall": "hold", "shape": box([0.0, 0.0], [1.0, 0.1])}]},
+            {"material": GRAINS, "colliders": [{"name": "plate", "shape": box([0.2, 0.1], [0.6, 0.101])}]},
+        ),
         ("restitution", {"colliders": [BOUNCY | {"restitution": 0.5}]}, {"colliders": [BOUNCY]}),
     ],
 )

@@ -25,6 +25,8 @@ FAST, SUPERSONIC = 1 / 3, 1.0
 SOFT = 0.3
 # Degrees by which the friction angle in triaxial extension may exceed the given one.
 STEEP = 10.0
+# Largest number of particles whose way to a wall is followed.
+MOST_WAYS = 256
 # Viscosity from which on a fluid is viscous, Pa s: between oil and honey.
 VISCOUS = 0.1
 
@@ -123,13 +125,13 @@ def _slippery(facts: SceneFacts) -> Iterator[Finding]:
     (axis, side), domain = _floor(facts), facts.scene.domain
     if side is None or domain.walls.faces(facts.scene.dimension)[axis][side] in PASSED | STICKING:
         return
-    gripping = [body.name for body in facts.bodies if _grips(body) and not _contained(facts, body)]
-    if gripping and domain.frictions[axis][side] == 0:
+    if domain.frictions[axis][side] == 0:
         face = f"{AXES[axis]}_{('min', 'max')[side]}"
         fix = f'Set domain.walls = {{ {face} = "stick" }}, or domain.friction = {{ {face} = 0.5 }}, if it should not.'
-        for name in gripping:
-            what = f'Body "{name}" slides on the wall {face}, which has no friction.'
-            yield Finding("note", "slippery", what, fix, 0.0, name)
+        for body in facts.bodies:
+            if _grips(body) and not _covered(facts, body, axis, side):
+                what = f'Body "{body.name}" slides on the wall {face}, which has no friction.'
+                yield Finding("note", "slippery", what, fix, 0.0, body.name)
 
 
 def _unpressed(facts: SceneFacts) -> Iterator[Finding]:
@@ -161,10 +163,19 @@ def _floor(facts: SceneFacts) -> tuple[int, int | None]:
     return axis, int(gravity[axis] > 0) if gravity.any() else None
 
 
-def _contained(facts: SceneFacts, body: BodyFacts) -> bool:
-    """Return whether a body starts inside a container."""
-    containers = [collider.form for collider in facts.scene.colliders if collider.side == "inside"]
-    return any(form.contains(body_points(body.body)).all() for form in containers)
+def _covered(facts: SceneFacts, body: BodyFacts, axis: int, side: int) -> bool:
+    """Return whether colliders lie on all ways of a body along an axis to a wall."""
+    points, domain = body_points(body.body), facts.scene.domain
+    ways = points[:: max(1, len(points) // MOST_WAYS)]
+    drops = ((domain.origin, domain.upper)[side][axis] - ways[:, axis]) * np.eye(facts.scene.dimension)[axis][:, None]
+    # So near to each other that no plate is missed.
+    shares = np.linspace(0.0, 1.0, 2 + int(2 * np.abs(drops).max() / domain.spacing))
+    places = ways + shares[:, None, None] * drops.T
+    blocked = np.zeros(len(ways), bool)
+    for one in (one for one in facts.scene.colliders if not (one.holds or one.free)):
+        distance = one.signed_distance(places.reshape(-1, facts.scene.dimension)).reshape(len(shares), -1)
+        blocked |= (distance < domain.spacing / 4).any(axis=0)
+    return bool(blocked.all())
 
 
 def _grips(body: BodyFacts) -> bool:
