@@ -12,6 +12,7 @@ from mpmcli.plain_text import plain_number
 from mpmcli.scene.bounds import body_points
 from mpmcli.scene.domain import PASSED, STICKING
 from mpmcli.scene.primitives import Box
+from mpmcli.scene.problem import quoted, several
 from mpmcli.scene.quantity import AXES
 
 # Poisson's ratio above which displacement fields of four particles per cell lock (tests/hard_cases, H10).
@@ -38,6 +39,7 @@ def material_findings(facts: SceneFacts) -> Iterator[Finding]:
             yield from rule(facts, body)
     yield from _density(facts)
     yield from _slippery(facts)
+    yield from _never_left(facts)
     yield from _unpressed(facts)
 
 
@@ -132,6 +134,15 @@ def _slippery(facts: SceneFacts) -> Iterator[Finding]:
             if _grips(body) and not _covered(facts, body, axis, side):
                 what = f'Body "{body.name}" slides on the wall {face}, which has no friction.'
                 yield Finding("note", "slippery", what, fix, 0.0, body.name)
+
+
+def _never_left(facts: SceneFacts) -> Iterator[Finding]:
+    """Yield colliders that slip, from which material does not part."""
+    slips = [one.name for one in facts.scene.colliders if one.wall == "slip"]
+    if slips and facts.scene.sources:
+        what = f'What touches {several(quoted(slips))} can slide there but not leave: that is wall = "slip".'
+        fix = 'Set wall = "separate", the default, where it should leave.'
+        yield Finding("note", "never-left", what, fix, len(slips), slips[0])
 
 
 def _unpressed(facts: SceneFacts) -> Iterator[Finding]:
