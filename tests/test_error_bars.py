@@ -329,7 +329,9 @@ def test_what_bars_do_not_contain_is_said() -> None:
 
     assert "Bodies stick" in told('contact={default="stick"}', name="billiard_2d")
     assert "Bodies stick" not in told('contact={default="separate"}', name="billiard_2d")
-    assert "from colliders" in told(name="hourglass_2d") and told(name="dam_break_2d") == ""
+    assert told(name="dam_break_2d") == "" == told(name="dam_break_obstacle_3d")
+    assert told(name="mixer_2d") == ""
+    assert "paddle: thinner than a cell" in told("domain.spacing=0.125", name="mixer_2d")
     assert "column: fewer than 4 cells thick" in told("domain.spacing=0.15", name="dam_break_2d")
 
 

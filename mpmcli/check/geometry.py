@@ -7,6 +7,7 @@ from itertools import product
 import numpy as np
 
 from mpmcli.scene import Scene
+from mpmcli.scene.colliders import Plane
 from mpmcli.scene.domain import STICKING
 from mpmcli.scene.primitives import TurnedBox, edge_distances
 from mpmcli.scene.shapes import Ball, Box, Capsule, Composite, Cylinder, Form, Mesh, Points, Polygon, distance_grid
@@ -65,6 +66,12 @@ def thickness(form: Form, endless: Collection[int] = ()) -> float:
         spacing = float(np.ptp(form.bounds(), axis=0).max()) / CELLS
         return -2 * float(distance_grid(form, spacing, 0.0)[0].min())
     return 2 * _inradius(form)
+
+
+def thin_colliders(scene: Scene, width: float) -> list[str]:
+    """Return the names of obstacles that are thinner than a width, m; rigid bodies and meshes are not looked at."""
+    solids = [one for one in scene.colliders if not (one.holds or one.free or one.side == "inside")]
+    return [one.name for one in solids if not isinstance(one.form, Plane | Mesh) and thickness(one.form) < width]
 
 
 def _inradius(form: Form) -> float:

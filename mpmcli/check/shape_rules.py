@@ -12,7 +12,7 @@ import numpy as np
 
 from mpmcli.check.facts import BodyFacts, SceneFacts
 from mpmcli.check.finding import Finding
-from mpmcli.check.geometry import close_pairs, thickness
+from mpmcli.check.geometry import close_pairs, thin_colliders
 from mpmcli.check.result_state import STRETCHED, TORN
 from mpmcli.scene import Scene
 from mpmcli.scene.bounds import body_points
@@ -22,7 +22,6 @@ from mpmcli.scene.primitives import grid_points
 from mpmcli.scene.problem import quoted, several
 from mpmcli.scene.quantity import AXES
 from mpmcli.scene.sampling import initial_deformation, initial_motion, moves_unevenly, starts_deformed
-from mpmcli.scene.shapes import Mesh
 from mpmcli.scene.surface import form_surface, surface_points
 
 # Cells across a body below which internal motion is not resolved, and a rigid body is permeable. The stencil is three
@@ -351,9 +350,7 @@ def _standoff(facts: SceneFacts) -> Iterator[Finding]:
         return
     what = f"Material that arrives at a collider or a rigid body comes to rest within {NEAR * h:.2g} m of its surface."
     fix, off = "Refine the domain if that matters.", NEAR * h
-    solids = [one for one in solid if not (one.free or one.side == "inside" or isinstance(one.form, Plane | Mesh))]
-    thin = [one.name for one in solids if thickness(one.form) < h]
-    if thin:
+    if thin := thin_colliders(scene, h):
         low, off = (cells * h for cells in STANDOFF)
         what += f" It stands {low:.2g} to {off:.2g} m off {several(quoted(thin))}, thinner than a cell."
         fix = f"Make colliders at least {h:.2g} m thick, or refine the domain."

@@ -11,6 +11,8 @@ from zipfile import BadZipFile
 
 import numpy as np
 
+from mpmcli.check.geometry import thin_colliders
+from mpmcli.check.shape_rules import STANDOFF
 from mpmcli.error_bars.bars import Bars, bars_of
 from mpmcli.error_bars.observables import Map, Observer, Series
 from mpmcli.error_bars.siblings import CAUSES, LEVELS, Cause, LeftOut, Level, Reach, Sibling, siblings_of, tables_of
@@ -64,8 +66,10 @@ class Study:
         shared = [source for source in self.scene.sources if not table.separates(source)]
         if len(shared) > 1 and any(source.has_surface for source in shared):
             found.append('Bodies stick: the bar does not contain that; contact.default = "separate" parts them.')
-        if self.scene.colliders and not all(source.has_surface for source in self.scene.sources):
-            found.append("Liquids and grains keep up to 1.5 cells from colliders: the bar may not contain that.")
+        plates = thin_colliders(self.scene, self.scene.domain.spacing)
+        if plates and not all(source.has_surface for source in self.scene.sources):
+            off = "liquids and grains stand {:g} to {:g} cells off; the bar may not contain that".format(*STANDOFF)
+            found.append(f"{several(plates)}: thinner than a cell, from which {off}.")
         coarsest = self.scene.domain.spacing * max((one.ratio for one, _ in self.runs), default=1.0)
         boxes = {body.name: np.ptp(np.array(body.shape.form.bounds()), axis=0) for body in self.scene.bodies}
         if thin := [name for name, size in boxes.items() if size.min() < THIN * coarsest]:
