@@ -3,6 +3,7 @@
 import json
 import math
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -85,6 +86,17 @@ def test_what_is_conserved_is_exact_to_rounding_beside_what_moves() -> None:
     # Without a coarser grid nothing says that it is exact.
     alone = bars_of(base, [(Sibling("half step", "step", {}), base)])
     assert not alone.of["a.velocity.x"].exact(-1)
+
+
+def test_what_spins_in_place_is_compared_with_its_momentum() -> None:
+    """L <= R sqrt(2 m E): its centre at rest is no measure. A spin that is 10 % off has that bar; one of 0 is exact."""
+    mass, energy = 8.0, 4.0
+    at_rest = {"a__velocity__x": 1e-10, "energy__kinetic": energy}
+    base = replace(series_of(spin__z=5.0, spin__x=1e-9, **at_rest), mass=mass)
+    bars = bars_of(base, [(grid(2.0), series_of(spin__z=5.5, spin__x=2e-9, **at_rest))]).of
+    assert bars["spin.z"].size == pytest.approx(math.sqrt(2 * mass * energy))
+    assert bars["spin.z"].text(-1) == "5.0 ± 0.5" and bars["spin.x"].exact(-1)
+    assert bars["a.velocity.x"].size == 1.0 and bars["a.velocity.x"].exact(-1)
 
 
 def test_runs_part_where_rounding_moves_half_a_percent_of_the_mass() -> None:

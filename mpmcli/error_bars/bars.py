@@ -8,6 +8,7 @@ study.
 """
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -160,10 +161,11 @@ def sizes_of(base: Series) -> dict[str, float]:
         return float(max(found, default=0.0)) or 1.0
 
     extent = float((base.reach.high - base.reach.low).max())
-    energy, speed = max(largest("energy.kinetic"), largest("energy.elastic")), largest(".velocity.")
-    force = largest(".force.")
-    # With E = m v^2 / 2 a momentum is 2 E / v.
-    likes = {"velocity": speed, "energy": energy, "spin": 2 * extent * energy / speed}
+    energy, force = max(largest("energy.kinetic"), largest("energy.elastic")), largest(".force.")
+    # With E = m v^2 / 2; the centre of what spins in place is at rest.
+    momentum = math.sqrt(2 * base.mass * energy)
+    speed = max(largest(".velocity."), momentum / base.mass if base.mass else 0.0)
+    likes = {"velocity": speed, "energy": energy, "spin": extent * momentum}
     likes |= {"force": force, "torque": force * extent} | dict.fromkeys(("volume error", "angle", *QUATERNION), 1.0)
     likes |= dict.fromkeys(("low", "high", "centre", *"xyz"), extent)
     found = {DENSITY: 1.0}

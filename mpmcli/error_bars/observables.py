@@ -62,13 +62,15 @@ class Series:
         time: (K,), s.
         values: (K,) by name; NaN where there is none.
         maps: (K, M), shares of the mass.
-        reach: of particles and rigid bodies; `seconds`: wall time without compilation; `steps`, `particles`: counts.
+        reach: of particles and rigid bodies; `mass`: theirs, the largest, kg; `seconds`: wall time without
+            compilation; `steps`, `particles`: counts.
     """
 
     time: np.ndarray
     values: dict[str, np.ndarray]
     maps: np.ndarray
     reach: Reach
+    mass: float = 0.0
     seconds: float = 0.0
     steps: int = 0
     particles: int = 0
@@ -95,6 +97,7 @@ class Observer:
         # Places along a periodic axis have no origin.
         self._axes = [k for k in range(d) if PERIODIC not in faces[k]]
         self._times: list[float] = []
+        self._heaviest = 0.0
         self._rows: list[dict[str, float]] = []
         self._maps: list[np.ndarray] = []
         self._bounds: list[tuple[np.ndarray, np.ndarray]] = []
@@ -105,6 +108,7 @@ class Observer:
         mass = self._mass if present.id is None else self._mass[present.id]
         x = present.position.astype(float)
         self._times.append(row.time)
+        self._heaviest = max(self._heaviest, row.mass + sum(self._rigid.values()))
         self._rows.append(self._observe(x, present, mass, row))
         self._maps.append(self.map.shares(x, mass).astype(np.float32))
         d = self.scene.dimension
@@ -124,7 +128,7 @@ class Observer:
         whole = np.array(domain.origin), np.array(domain.origin) + domain.size
         lows, highs = (np.array(part) for part in zip(*(self._bounds or [whole]), strict=True))
         reach = Reach(lows.min(0), highs.max(0), (lows[0] + highs[0]) / 2)
-        return Series(np.array(self._times), values, np.array(self._maps), reach)
+        return Series(np.array(self._times), values, np.array(self._maps), reach, self._heaviest)
 
     def _observe(self, x: np.ndarray, frame: Frame, mass: np.ndarray, row: LedgerRow) -> dict[str, float]:
         d, found = self.scene.dimension, {}

@@ -188,7 +188,7 @@ class Student:
         recording = self._runner.run(scene, stop, observer.take, particles)
         if recording.verdict in BROKEN:
             raise RunError(f"The run of {name} is {recording.verdict}: {recording.reason}")
-        facts = {name: getattr(recording, name) for name in _Kept.FACTS}
+        facts = {name: getattr(recording, name) for name in ("seconds", "steps", "particles")}
         series = replace(observer.series(), **facts)
         kept.keep(series)
         return series
@@ -202,7 +202,7 @@ class _Kept:
     """The file of one series; it is found again for the same tables, map, observables and program."""
 
     ARRAYS = ("time", "maps")
-    FACTS = ("seconds", "steps", "particles")
+    FACTS = ("mass", "seconds", "steps", "particles")
 
     def __init__(self, student: Student, name: str, tables: Mapping[str, Any]) -> None:
         plan = student.plan
