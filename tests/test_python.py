@@ -48,6 +48,12 @@ def test_the_page_runs_and_a_run_has_the_bytes_of_the_command(tmp_path: Path, ru
     result = open_result(tmp_path / "results" / "python")
     assert found["time"] == result.times.tolist()
     assert found["energy"] == pytest.approx([row.energy for row in result.ledger], rel=1e-15)
+    ledger = result.ledger
+    assert ledger["kinetic"].tolist() == [row.kinetic for row in ledger] and ledger["linear_momentum"].shape == (11, 2)
+    assert ledger["energy"] == pytest.approx(found["energy"], rel=1e-15) and ledger[-1] == list(ledger)[-1]
+    for name, said in (("kinetik", 'did you mean "kinetic"'), ("emitted", "it has time, steps, ")):
+        with pytest.raises(InputError, match=f'has no "{name}"; .*{said}'):
+            ledger[name]
     assert found["lowest"] == result.frame(10).position[:, 1].min()
     n = result.frame(0).position.shape[0]
     assert found["shapes"] == {

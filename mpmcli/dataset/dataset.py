@@ -13,7 +13,7 @@ from mpmcli.dataset.report import MOST_NAMED, status_of
 from mpmcli.dataset.shard import LABELS, MOVING, SHARDS, SPLITS, SWEEP, TABLES, StoredGroup, moving_names, open_shard
 from mpmcli.errors import InputError
 from mpmcli.frames.frame import ACTIVE, RETIRED, STATUS, WAITING, Frame
-from mpmcli.frames.ledger import LedgerRow
+from mpmcli.frames.ledger import Ledger
 from mpmcli.output import Result, open_result
 from mpmcli.output.collider_files import as_they_moved
 from mpmcli.output.header import RunHeader
@@ -118,7 +118,7 @@ class Trajectory(ABC):
 
     @property
     @abstractmethod
-    def ledger(self) -> list[LedgerRow]:
+    def ledger(self) -> Ledger:
         """T rows; each access reads the file."""
 
     @abstractmethod
@@ -139,7 +139,7 @@ class _StoredTrajectory(Trajectory):
             self.particle_count = stored.group["position"].shape[1]
 
     @property
-    def ledger(self) -> list[LedgerRow]:
+    def ledger(self) -> Ledger:
         with open_shard(self._shard) as file:
             return StoredGroup(file, self.number).ledger()
 
@@ -179,7 +179,7 @@ class _ResultTrajectory(Trajectory):
         return self._result.colliders
 
     @property
-    def ledger(self) -> list[LedgerRow]:
+    def ledger(self) -> Ledger:
         return self._result.ledger
 
     def _read(self, name: str, frames: slice) -> np.ndarray:

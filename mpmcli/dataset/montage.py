@@ -12,6 +12,7 @@ import numpy as np
 from mpmcli.dataset.dataset import Dataset, Trajectory, open_dataset
 from mpmcli.dataset.report import MONTAGE, number_text
 from mpmcli.errors import InputError
+from mpmcli.frames.ledger import Ledger
 from mpmcli.output.header import BodyHeader
 from mpmcli.output.layout import POSITION, STANDARD, FrameIndex, FrameLayout
 from mpmcli.output.result import Result
@@ -73,7 +74,7 @@ class TrajectoryCells(Result):
             np.array([each.steps[k] for each, k in pairs]),
             np.zeros(len(pairs), np.int64),
             np.array([each.particle_count for each in self._trajectories]),
-            [each.ledger[k] for each, k in pairs],
+            Ledger(each.ledger[k] for each, k in pairs),
         )
         super().__init__(dataset.path, index)
         self.collider_frames = tuple(each.number for each in self._trajectories for _ in each.colliders)

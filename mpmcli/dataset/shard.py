@@ -25,7 +25,7 @@ import h5py
 import numpy as np
 
 from mpmcli.errors import InputError
-from mpmcli.frames.ledger import LedgerRow
+from mpmcli.frames.ledger import Ledger, LedgerRow
 from mpmcli.output import checksums
 from mpmcli.output.checksums import NAME as CHECKSUMS
 from mpmcli.output.checksums import (
@@ -241,6 +241,6 @@ class StoredGroup:
         for error in self._checksums.differences(items):
             raise error
 
-    def ledger(self) -> list[LedgerRow]:
+    def ledger(self) -> Ledger:
         """Read the ledger."""
         return read_ledger(self.group[LEDGER], lambda name: self.table(f"{LEDGER}/{name}"))

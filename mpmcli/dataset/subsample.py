@@ -9,7 +9,7 @@ import numpy as np
 
 from mpmcli.dataset.dataset import ALL, Particles, Trajectory
 from mpmcli.frames.frame import ACTIVE, STATUS
-from mpmcli.frames.ledger import LOADS, LedgerRow
+from mpmcli.frames.ledger import LOADS, Ledger, LedgerRow
 from mpmcli.output.header import RunHeader
 from mpmcli.output.layout import FrameLayout
 from mpmcli.scene.colliders import Collider, Motion
@@ -191,10 +191,10 @@ class SubsampledTrajectory:
             yield np.concatenate([block, walls.astype(block.dtype)], axis=1)
             first += len(block)
 
-    def ledger(self) -> list[LedgerRow]:
+    def ledger(self) -> Ledger:
         """Return a row for each frame; counts since the previous frame include the omitted frames between them."""
         rows = self.source.ledger
-        found = []
+        found = Ledger()
         for k in range(0, len(rows), self.stride):
             first = max(k - self.stride + 1, 0)
             found.append(joined_row(rows[first : k + 1], rows[max(first - 1, 0)].time))

@@ -1,6 +1,12 @@
 """One row of the ledger of a run: events up to a frame, and conserved quantities at it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from mpmcli.errors import InputError
+from mpmcli.scene.problem import hint_at, listed
 
 # Entries per collider, and per pair of bodies that separate.
 LOADS = ("collider_force", "collider_torque", "contact_force", "contact_torque")
@@ -83,3 +89,17 @@ class LedgerRow:
     def energy(self) -> float:
         """Total energy, J."""
         return self.kinetic + self.elastic + self.potential
+
+
+class Ledger(list[LedgerRow]):
+    """The rows of a run, one for each of T frames; `ledger["kinetic"]` is an array over them."""
+
+    def __getitem__(self, key: Any) -> Any:
+        """Return a row by its number, or by its name one quantity of all rows, (T, ...); InputError: there is none."""
+        if not isinstance(key, str):
+            return super().__getitem__(key)
+        names = [one.name for one in fields(LedgerRow) if self and getattr(self[0], one.name) not in (None, ())]
+        if key not in (*names, "energy"):
+            hint = hint_at(key, names, f"it has {listed(names, 'and')}.")
+            raise InputError(f'The ledger has no "{key}"; {hint}')
+        return np.array([getattr(row, key) for row in self])

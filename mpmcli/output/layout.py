@@ -16,7 +16,7 @@ import h5py
 import numpy as np
 
 from mpmcli.frames.frame import Frame
-from mpmcli.frames.ledger import LOADS, RIGID, LedgerRow
+from mpmcli.frames.ledger import LOADS, RIGID, Ledger, LedgerRow
 from mpmcli.output.durable import numbered_files, remove_numbered
 
 POSITION = "Points"  # VTK's name; every other array keeps its own
@@ -188,7 +188,7 @@ class FrameIndex:
     steps: np.ndarray
     offsets: np.ndarray
     counts: np.ndarray
-    ledger: list[LedgerRow]
+    ledger: Ledger
     checksums: np.ndarray | None = None
 
     def __post_init__(self) -> None:
@@ -205,7 +205,7 @@ class FrameIndex:
             indices[0],
             **tables,
             offsets=np.cumsum(tables["counts"]) - tables["counts"],
-            ledger=[row for index in indices for row in index.ledger],
+            ledger=Ledger(row for index in indices for row in index.ledger),
         )
 
 
@@ -244,12 +244,12 @@ def _stored(rows: Sequence[LedgerRow]) -> tuple[str, ...]:
     return tuple(name for name in COLUMNS if name not in OPTIONAL or (rows and getattr(rows[0], name) is not None))
 
 
-def read_ledger(group: h5py.Group, read: Callable[[str], np.ndarray]) -> list[LedgerRow]:
+def read_ledger(group: h5py.Group, read: Callable[[str], np.ndarray]) -> Ledger:
     """Read the ledger in a group, each column by `read`."""
     return ledger_rows({name: read(name) for name in COLUMNS if name in group})
 
 
-def ledger_rows(columns: Mapping[str, np.ndarray]) -> list[LedgerRow]:
+def ledger_rows(columns: Mapping[str, np.ndarray]) -> Ledger:
     """Inverse of `ledger_columns`; a column of `MISSING` may be absent."""
     lists = []
     for name in COLUMNS:
@@ -264,7 +264,7 @@ def ledger_rows(columns: Mapping[str, np.ndarray]) -> list[LedgerRow]:
         elif name in PER_PART:
             values = [tuple(map(tuple, value)) for value in values]
         lists.append(values)
-    return [LedgerRow(*values) for values in zip(*lists, strict=True)]
+    return Ledger(LedgerRow(*values) for values in zip(*lists, strict=True))
 
 
 def ledger_csv(rows: Sequence[LedgerRow], frames: Sequence[tuple[int, ...]]) -> str:

@@ -12,7 +12,6 @@ import numpy as np
 from mpmcli.errors import InputError
 from mpmcli.extras import imported
 from mpmcli.frames.frame import ACTIVE, STATUS, Frame
-from mpmcli.frames.ledger import LedgerRow
 from mpmcli.output.checksums import DamageError, checksum, damaged, first_line
 from mpmcli.output.collider_files import as_they_moved, read_stored_surfaces
 from mpmcli.output.header import RunHeader
@@ -40,7 +39,7 @@ class Result(ABC):
         times: (T,) float64, s.
         numbers: (T,) frame numbers.
         particle_counts: (T,) particles of each frame.
-        ledger: T rows.
+        ledger: T rows; by the name of a quantity an array over the frames, as `ledger["kinetic"]`.
         header: facts about the run.
         dimension: 2 or 3.
         field_names: the fields of each Frame, without position, velocity, body and material.
@@ -59,7 +58,7 @@ class Result(ABC):
         self.times = index.times
         self.numbers = index.frames
         self.particle_counts = index.counts
-        self.ledger: list[LedgerRow] = index.ledger
+        self.ledger = index.ledger
         try:
             self.header = RunHeader.read(index.header)
         except ValueError as error:
