@@ -104,6 +104,7 @@ def sweep(
     *,
     count: int | None = None,
     workers: int | None = None,
+    threads: int = 1,
     overwrite: bool = False,
     resume: bool = False,
     arch: Arch = "auto",
@@ -119,7 +120,8 @@ def sweep(
         file: the TOML file of the sweep.
         output: directory of the dataset, by default datasets/ and the name of the file.
         count: number of trajectories, in place of that of the file.
-        workers: number of processes, by default one for each core.
+        workers: number of processes, by default as many as cores have threads for.
+        threads: CPU threads of each, for trajectories of 20,000 particles and more.
         overwrite, resume, arch, plugins, progress: as of `run`.
         overrides: values of the base scene by key, for all trajectories.
 
@@ -132,10 +134,13 @@ def sweep(
     files = tuple(map(Path, plugins))
     loaded = load_sweep(Path(file), laws=load_plugins(files), count=count, overrides=_as_set(overrides))
     directory = Path("datasets") / Path(file).stem if output is None else Path(output)
-    options = {"workers": workers, "overwrite": overwrite, "resume": resume, "arch": arch, "plugins": files}
+    options = {"workers": workers, "threads": threads, "overwrite": overwrite, "resume": resume, "arch": arch}
     with ProgressBar(loaded.count, "trajectories", quiet=not progress) as bar:
         state = run_sweep(
-            loaded, SweepSettings(directory, **options), lambda state: bar.show(state.done, "", ""), lambda: False
+            loaded,
+            SweepSettings(directory, **options, plugins=files),
+            lambda state: bar.show(state.done, "", ""),
+            lambda: False,
         )
     if state.status == "interrupted":
         raise KeyboardInterrupt

@@ -10,6 +10,7 @@ import sys
 import time
 import tomllib
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,11 +21,12 @@ import psutil
 import pytest
 from command import ROOT, run_here, started
 from good_sweep import SWEEP
-from made_sweep import COUNT, made_workers, make_dataset, small_sweep  # noqa: F401
+from made_sweep import COUNT, MadeWorkers, made_workers, make_dataset, small_sweep  # noqa: F401
 from test_plugin import LAW
 from tiny_sweep import BASE, contents, small_shards, tiny_sweep, told, write_sweep
 
 from mpmcli.dataset import open as open_dataset
+from mpmcli.dataset import sweep_run
 from mpmcli.dataset.compute import Task, _with_step, compute
 from mpmcli.dataset.draw import draw
 from mpmcli.dataset.folder import Manifest, program, source_files, standing_alone
@@ -106,6 +108,22 @@ def test_parts_and_another_number_of_workers_make_the_same_dataset(
     with pytest.raises(InputError, match="a part is given twice"):
         merge([parts[0], parts[0], parts[1]], tmp_path / "half")
     assert not (tmp_path / "half").exists()
+
+
+@pytest.mark.parametrize(
+    ("said", "count", "threads"), [((), 8, 1), (("--threads", 3), 2, 3), (("--threads", 16, "--workers", 5), 5, 16)]
+)
+@pytest.mark.usefixtures("made_workers")
+def test_workers_have_threads_as_asked(said: tuple, count: int, threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of 8 cores each worker takes its threads, unless the number of workers is given."""
+    small_sweep()
+    counts: list[int] = []
+    made: list[Task] = []
+    monkeypatch.setattr(sweep_run, "available_cores", lambda: 8)
+    monkeypatch.setattr(sweep_run, "local_workers", lambda count: counts.append(count) or nullcontext(MadeWorkers()))
+    monkeypatch.setattr(sweep_run, "_tasks", lambda *given: made.extend(_tasks(*given)) or made)
+    run_here("sweep", "sweep.toml", "-o", "d", "-q", "--count", COUNT, *said)
+    assert counts == [count] and {task.threads for task in made} == {threads}
 
 
 @pytest.mark.parametrize("column", ["version", "taichi", "arch"])

@@ -21,7 +21,14 @@ RESERVE = 5.0
 @click.argument("sweep", type=PATH)
 @options.output_option("Directory of the dataset; datasets/<name of the sweep> by default.", "DATASET", "directory")
 @click.option("--count", type=COUNT, help="Number of trajectories, in place of that of the file.")
-@click.option("--workers", type=COUNT, help="Processes on this machine; one on each core by default.")
+@click.option("--workers", type=COUNT, help="Processes on this machine; by default as many as cores have threads for.")
+@click.option(
+    "--threads",
+    type=COUNT,
+    default=1,
+    show_default=True,
+    help="CPU threads of each worker, for trajectories of 20,000 particles and more; smaller ones take one.",
+)
 @click.option("--scheduler", metavar="ADDRESS", default="", help="Use the workers of a running Dask scheduler.")
 @click.option(
     "--shard",

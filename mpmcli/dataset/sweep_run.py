@@ -65,9 +65,9 @@ MOST_ROWS, MOST_FAULTS = 20, 10
 class SweepSettings:
     """Settings of a sweep that are not part of its file.
 
-    `workers` is the number of local processes, None for one per core, unless a Dask `scheduler` at an address has them;
-    `part` (i, n) is every n-th shard from the i-th on; `overwrite` replaces a dataset that is there; arch and threads
-    are for each worker.
+    `workers` is the number of local processes, None for as many as cores have threads for, unless a Dask `scheduler` at
+    an address has them; `part` (i, n) is every n-th shard from the i-th on; `overwrite` replaces a dataset that is
+    there; arch and threads are for each worker, and small trajectories take one thread.
     """
 
     directory: Path
@@ -77,12 +77,17 @@ class SweepSettings:
     resume: bool = False
     overwrite: bool = False
     arch: Arch = "auto"
-    threads: int | None = 1
+    threads: int = 1
     plugins: tuple[Path, ...] = ()
 
     def __post_init__(self) -> None:
         if self.resume and self.overwrite:
             raise InputError("--resume keeps an earlier dataset, and --overwrite removes it: give one of them.")
+
+    @property
+    def processes(self) -> int:
+        """Number of processes on this machine."""
+        return self.workers or max(1, available_cores() // self.threads)
 
 
 @dataclass
@@ -344,7 +349,7 @@ class _Run:
         state, missing = self.state, [n for n in self.folder.all_numbers() if n not in self.rows]
         if not missing:
             return
-        count = min(self.settings.workers or available_cores(), len(missing))
+        count = min(self.settings.processes, len(missing))
         with nullcontext(joined) if joined else local_workers(count) as workers:
             since = time.perf_counter()
             state.start_seconds = since - began
@@ -484,7 +489,7 @@ def rehearse(sweep: Sweep, settings: SweepSettings) -> Rehearsal:
         found.append(Rehearsed(number, sweep.split_of(number), values, *counts, fault))
     used = {sweep.split_of(number) for number in range(min(sweep.count, SURE))}
     empty = tuple(name for name, share in sweep.split if share > 0 and name not in used)
-    return Rehearsal(tuple(found), settings.workers or available_cores(), empty)
+    return Rehearsal(tuple(found), settings.processes, empty)
 
 
 def _short(value: Any) -> str:
