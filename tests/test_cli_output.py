@@ -7,12 +7,14 @@ import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from command import CONFIGS, ROOT, SCENE, Outcome, run_here
 
 from mpmcli import __version__
 from mpmcli.output import open_result
+from mpmcli.simulation.summary import RunSummary
 
 
 @dataclass(frozen=True)
@@ -211,3 +213,18 @@ def test_json_that_cannot_be_written_is_told(run_python):
     assert done.returncode == 1 and done.stderr.startswith("error: The result could not be printed on stdout (No space")
     done = run_python(["-m", "mpmcli", "schema"], environment={"PYTHONIOENCODING": "ascii"})
     assert json.loads(done.stdout)["title"] == "Scene"
+
+
+@pytest.mark.parametrize(
+    ("laws", "largest", "told"),
+    [(["fluid"], 1.96, True), (["fluid"], 1.05, False), (["fluid", "neo_hookean"], 1.96, False)],
+)
+def test_a_wide_range_of_J_is_explained_in_liquids_alone(laws: list[str], largest: float, told: bool) -> None:
+    """Spray has come apart; a solid may be stretched."""
+    plan = SimpleNamespace(laws=[SimpleNamespace(law=name) for name in laws])
+    row = SimpleNamespace(energy=1.0, kinetic=1.0, elastic=0.0, potential=0.0, volume_ratio_min=0.98, blocked=None)
+    row.volume_ratio_max = largest
+    timings = dict.fromkeys(("start_s", "compile_s", "solve_s", "output_s", "wall_s"), 1.0)
+    summary = RunSummary(Path("r"), 1, 2, {}, (), plan, frames=2, timings=timings, first=row, last=row)
+    (line,) = (line for line in summary.text().splitlines() if line.startswith("volume ratio J at the end: 0.98 to "))
+    assert line.endswith(", above 1 where liquid has come apart, as in spray") == told

@@ -9,7 +9,11 @@ from pathlib import Path
 from mpmcli.check.finding import merged
 from mpmcli.check.result_check import ResultCheck
 from mpmcli.frames.ledger import LedgerRow
+from mpmcli.materials.registry import laws
 from mpmcli.solver.engine.plan import Plan
+
+# J of a liquid above which it has come apart.
+APART = 1.1
 
 
 @dataclass
@@ -94,7 +98,11 @@ class RunSummary:
                 f"energy: {first.energy:.5g} -> {last.energy:.5g} J (kinetic {last.kinetic:.4g}, elastic "
                 f"{last.elastic:.4g}, potential {last.potential + 0.0:.4g})"
             )
-            lines.append(f"volume ratio J at the end: {last.volume_ratio_min:.4g} to {last.volume_ratio_max:.4g}")
+            wide = last.volume_ratio_max > APART and all(laws()[one.law].deformation == "J" for one in self.plan.laws)
+            apart = ", above 1 where liquid has come apart, as in spray" if wide else ""
+            lines.append(
+                f"volume ratio J at the end: {last.volume_ratio_min:.4g} to {last.volume_ratio_max:.4g}{apart}"
+            )
         if self.last is not None and self.last.blocked:
             lines.append(f"blocked: {self.last.blocked} particles of emitters found their place occupied")
         if self.path is not None:
