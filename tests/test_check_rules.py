@@ -540,6 +540,7 @@ TILTED = box([0.25, 0.2], [0.5, 0.45])
             {"colliders": [PART | {"angular_velocity": 6.0}]},
         ),
         ({"colliders": [PART | {"angle": "90*t"}]}, "1.571", {"colliders": [PART | {"angle": "0.05*sin(1000*t)"}]}),
+        ({"colliders": [PART | {"angular_velocity": 90.0}], "time": {"end": 0.03}}, "1.57", {}),
         ({"colliders": [PART | {"angle": 45.0}]}, "45 degrees are 0.7854", {"colliders": [PART | {"angle": 0.7854}]}),
         ({"colliders": [PART | TURNED]}, "90 degrees are 1.571", {}),
         (

@@ -279,6 +279,12 @@ REPLACED = [
         "18: bodies[1].material.friction_angle: must be greater than 0; for a material without friction take "
         'law = "von_mises" with a yield_stress of 1.73 times its cohesion; found 0',
     ),
+    (
+        'law = "neo_hookean"',
+        'law = "sand"\nrepose_angle = 0.0',
+        "18: bodies[1].material.repose_angle: must be greater than 0; for a material without friction take "
+        'law = "von_mises" with a yield_stress of 1.73 times its cohesion; found 0.0',
+    ),
 ]
 
 

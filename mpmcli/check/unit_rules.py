@@ -104,9 +104,9 @@ def _spins(one: Collider, rate: float, end: float) -> bool:
 
 
 def _goes_round(one: Collider, rate: float, end: float) -> bool:
-    """Return whether a collider turns by more than a vibration does, a full turn."""
+    """Return whether a collider does not vibrate: it makes a full turn, or its rate is constant."""
     angles = [one.motion.at(time)[1] for time in np.linspace(0.0, end, INSTANTS)]
-    return float(np.ptp(angles)) > math.tau
+    return float(np.ptp(angles)) > math.tau or float(np.ptp(np.diff(angles, n=2))) < 1e-9 * rate * end
 
 
 def _rotations(facts: SceneFacts) -> Iterator[Finding]:

@@ -106,11 +106,11 @@ class SandParameters(HenckyParameters):
             raise flaw(f"must be at most {most:g} degrees in 3D, {_PULLED}; found {slope:g}", "repose_angle")
         return {**said, "friction_angle": angle}
 
-    @field_validator("friction_angle", mode="before")
+    @field_validator("friction_angle", "repose_angle", mode="before")
     @classmethod
     def _rubs(cls, value: Any) -> Any:
         """Refuse material without friction, whose law is another one: in simple shear it yields at its cohesion."""
-        if isinstance(value, int | float) and value == 0:
+        if value == 0 and value is not False:
             other = 'law = "von_mises" with a yield_stress of 1.73 times its cohesion'
             raise flaw(f"must be greater than 0; for a material without friction take {other}; found {value}")
         return value
