@@ -152,6 +152,16 @@ REPLACED = [
         '[domain.walls]\nz_min = "stick"\n[time]',
         "7: domain.walls.z_min: is a face of a 3D scene and this one is 2D; leave it out",
     ),
+    (
+        'name = "drop"',
+        'name = "drop"\ncolliders = []',
+        "15: bodies[1].colliders: unknown key here; it belongs at the top",
+    ),
+    (
+        "radius = 0.5 }",
+        "radius = 0.5 }\nshape.add = { ball = { center = [3.0, 1.0], radius = 0.6 } }",
+        "16: bodies[1].shape.add: must be a list of tables: write add = [{ ... }]; found a table with ball",
+    ),
     ("ball = {", "bal = {", '15: bodies[1].shape.bal: unknown key; did you mean "ball"?'),
     (
         "[bodies.material]",

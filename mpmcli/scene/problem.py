@@ -190,8 +190,8 @@ def _problem(path: Path, errors: list[Any], model: type[BaseModel]) -> Problem:
             known = ctx["expected_tags"].replace("'", '"').replace(", ", " or ")
             return Problem((*path, ctx["discriminator"].strip("'")), f"must be {known}; found {written(ctx['tag'])}")
         case "tuple_type" | "list_type" if isinstance(value, dict) and any(_tables_at(model, first["loc"])):
-            name = path_text(tuple(part for part in path if isinstance(part, str)))
-            return Problem(path, f"must be a list of tables: write [[{name}]] for each entry; found {written(value)}")
+            right = f"[[{path[0]}]] for each entry" if len(path) == 1 else f"{path[-1]} = [{{ ... }}]"
+            return Problem(path, f"must be a list of tables: write {right}; found {written(value)}")
         case "model_type" | "model_attributes_type" if isinstance(value, list):
             name = path_text(tuple(part for part in path if isinstance(part, str)))
             return Problem(path, f"must be one table: write [{name}] or {path[-1]} = {{ ... }}; found a list")
@@ -203,7 +203,8 @@ def _unknown_key(loc: Path, model: type[BaseModel]) -> str:
     if guess := nearest(key, known):
         return f'unknown key; did you mean "{guess}"?'
     tables = [("domain",), ("time",), ("output",), ("solver",), ()]
-    if home := next((t for t in tables if t != loc[:-1] and key in known_keys(model, t)), None):
+    home = next((t for t in tables if t != loc[:-1] and key in known_keys(model, t)), None)
+    if home is not None:
         return f"unknown key here; it belongs to [{home[0]}]" if home else "unknown key here; it belongs at the top"
     return f"unknown key; the keys here are {listed(known, 'and')}"
 
