@@ -630,7 +630,7 @@ DRUM = {"name": "drum", "side": "inside", "shape": {"ball": {"center": [0.5, 0.5
             {"material": GRAINS, "colliders": [{"name": "plate", "shape": box([0.2, 0.1], [0.6, 0.101])}]},
         ),
         (
-            "never-left",
+            "slip",
             {"colliders": [{"name": "cone", "wall": "slip", "shape": box([0.7, 0.0], [0.8, 0.1])}]},
             {"colliders": [{"name": "cone", "shape": box([0.7, 0.0], [0.8, 0.1])}]},
         ),

@@ -39,7 +39,7 @@ def material_findings(facts: SceneFacts) -> Iterator[Finding]:
             yield from rule(facts, body)
     yield from _density(facts)
     yield from _slippery(facts)
-    yield from _never_left(facts)
+    yield from _pulling(facts)
     yield from _unpressed(facts)
 
 
@@ -136,13 +136,13 @@ def _slippery(facts: SceneFacts) -> Iterator[Finding]:
                 yield Finding("note", "slippery", what, fix, 0.0, body.name)
 
 
-def _never_left(facts: SceneFacts) -> Iterator[Finding]:
-    """Yield colliders that slip, from which material does not part."""
+def _pulling(facts: SceneFacts) -> Iterator[Finding]:
+    """Yield colliders that slip, which push and pull."""
     slips = [one.name for one in facts.scene.colliders if one.wall == "slip"]
     if slips and facts.scene.sources:
-        what = f'What touches {several(quoted(slips))} can slide there but not leave: that is wall = "slip".'
-        fix = 'Set wall = "separate", the default, where it should leave.'
-        yield Finding("note", "never-left", what, fix, len(slips), slips[0])
+        what = f'The wall = "slip" of {several(quoted(slips))} also pulls: material may leave it late or never.'
+        fix = 'Set wall = "separate", the default, where material should leave.'
+        yield Finding("note", "slip", what, fix, len(slips), slips[0])
 
 
 def _unpressed(facts: SceneFacts) -> Iterator[Finding]:

@@ -92,7 +92,7 @@ def _turns(facts: SceneFacts) -> Iterator[Finding]:
             yield Finding("note", "units", what, fix, rate, one.name)
             continue
         angle = max(abs(key) for key in (one.motion.angle, *(key.angle for key in one.keyframes)))
-        if angle > math.tau and angle == round(angle):
+        if angle > math.tau and angle % 1 == 0:
             what = f'Collider "{one.name}" is turned by {angle:g} rad, {angle / math.tau:.3g} turns.'
             fix = f"Angles of a motion are in rad: {angle:g} degrees are {math.radians(angle):.4g}."
             yield Finding("note", "units", what, fix, angle, one.name)
