@@ -67,7 +67,7 @@ def _density(facts: SceneFacts) -> Iterator[Finding]:
 
 
 def _modulus(facts: SceneFacts) -> Iterator[Finding]:
-    """Yield moduli far below the pressures of the scene, which may be in kPa, MPa or GPa."""
+    """Yield moduli far below the pressures of the scene, which may be in MPa or GPa."""
     bounds = facts.bounds
     for source in facts.scene.sources:
         law = law_of(source, facts.scene.dimension)
