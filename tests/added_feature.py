@@ -53,4 +53,4 @@ class Drag(Feature):
 
     def tell(self, values: np.ndarray, _run: int, found: dict[str, np.ndarray]) -> None:
         # A column of the ledger that this scene has no other use for; a new one is a line of `LedgerRow`.
-        found["contact_gap"] = values[:, 0]
+        found["contact_overlap"] = values[:, 0]

@@ -102,7 +102,7 @@ DRIVES = (
     ),
     *_of(
         "scene/sampling.py",
-        ("volume, body.material.density * volume", "volume, 1.05 * body.material.density * volume", "bar_fixed_fixed"),
+        ("mass = body.material.density * volume", "mass = 1.05 * body.material.density * volume", "bar_fixed_fixed"),
         ("volume = rest_volume(", "volume = 1.05 * rest_volume(", "conservation"),
     ),
     *_of(
@@ -220,19 +220,16 @@ PLASTIC = (
         ("(variables[0] * lost,", "(variables[0] * lost**0.95,", "snow_blocks"),
     ),
 )
-CONTACT = _of(
-    "solver/contact/body_contact.py",
-    ("rub = ti.min(friction * push", "rub = ti.min(1.05 * friction * push", "slope_contact"),
-    ("along = u + aside", "along = u + 0.0 * aside", "rolling_contact"),
-    # Mean normals, which tilt beside edges; all faces taken as parallel; the places of particles in place of their
-    # surface.
-    ("normal[b] = faces[0, b] + faces[1, b]", "normal[b] = n_a[b] - n_c[b]", "slope_contact"),
-    (
-        "if alike < SAME:",
-        "if alike < -SAME:",
-        "rolling_contact slope_contact",
-        "no case presses the edge of a body into another; tests/test_wall_contact.py does",
+CONTACT = (
+    *_of(
+        "solver/contact/body_contact.py",
+        ("rub = ti.min(friction * push", "rub = ti.min(1.05 * friction * push", "slope_contact"),
+        ("along = u + aside", "along = u + 0.0 * aside", "rolling_contact"),
     ),
-    ("way[b] -= point[b]", "way[b] -= 0.0 * point[b]", "two_disks_contact"),
+    # The places of particles in place of their surface.
+    *_of(
+        "solver/contact/surfaces.py",
+        ("way[c] += self.surface[g][p][d + c]", "way[c] += 0.0 * self.surface[g][p][d + c]", "two_disks_contact"),
+    ),
 )
 SMALL_PLANTS = (*TRANSFERS, *DRIVES, *WALLS, *CONTACT, *ELASTIC, *FLUIDS, *PLASTIC)

@@ -86,7 +86,7 @@ def test_a_drag_slows_all_that_flies_and_goes_on_after_a_pause(
     for k, start in enumerate(STARTS):
         own = frame.velocity[frame.body == k].mean(axis=0)
         np.testing.assert_allclose(own, np.multiply(left(RATE), start), rtol=1e-5, atol=1e-6)
-    assert row.contact_gap == pytest.approx((COUNT - 0.5) * STEP, rel=1e-5)
+    assert row.contact_overlap == pytest.approx((COUNT - 0.5) * STEP, rel=1e-5)
     again = build_run(asked, backend)
     again.load(saved)
     for _ in range(COUNT // 2, COUNT):

@@ -63,13 +63,13 @@ def test_contact_on_a_gpu_follows_that_on_the_cpu(backend_of: Callable, dimensio
         frame, row = run.frame()
         told = np.array([*row.contact_force, *row.collider_force])
         assert np.abs(run.frame()[1].contact_force).max() == 0.0
-        found.append((frame, told, row.contact_overlap, row.contact_gap))
-    (own, told, *extremes), (other, expected_told, *expected_extremes) = found
+        found.append((frame, told, row.contact_overlap))
+    (own, told, overlap), (other, expected_told, expected_overlap) = found
     apart = farthest(other.position, other.velocity, steps, other.time)
     assert np.abs(own.position - other.position).max() < apart
-    assert (np.abs(expected_told[[-2, -1], 0]) > 10).all()
+    assert (np.abs(expected_told[[-2, -1], 0]) > 5).all()
     assert np.abs(told - expected_told).max() < 1e-3 * np.abs(expected_told).max()
-    assert extremes == pytest.approx(expected_extremes, rel=1e-3)
+    assert overlap == pytest.approx(expected_overlap, rel=1e-3)
 
 
 @pytest.mark.slow

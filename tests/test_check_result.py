@@ -183,10 +183,10 @@ def test_surfaces_that_overlap_by_more_than_a_cell_are_found(run, checked):
     """Where bodies separate the ledger has how deep."""
     assert checked().figures["contact_overlap"] is None
     for deepest, found in ((0.9, []), (1.1, [("overlap", "warning", K)])):
-        rows = [replace(row, contact_overlap=deepest * (k == K), contact_gap=0.1) for k, row in enumerate(run.rows)]
+        rows = [replace(row, contact_overlap=deepest * (k == K)) for k, row in enumerate(run.rows)]
         check = checked(rows=rows)
         assert [(f.rule, f.severity, f.frame) for f in check.findings] == found
-        assert (check.figures["contact_overlap"], check.figures["contact_gap"]) == (deepest, 0.1)
+        assert check.figures["contact_overlap"] == deepest
 
 
 def test_a_collapsed_step_is_found(run, checked):

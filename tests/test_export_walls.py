@@ -177,7 +177,6 @@ def test_forces_of_joined_frames_are_means_over_their_time(tmp_path: Path) -> No
     assert np.allclose(joined.collider_torque, ((mean,), (2.0,)), rtol=1e-15)
     assert np.allclose(joined.contact_torque, ((mean,),), rtol=1e-15)
     assert joined.contact_overlap == pytest.approx(0.3) and joined.contact_work == 9.0
-    assert joined.contact_gap is None
 
 
 def test_walls_inside_of_others_have_no_particles(tmp_path: Path) -> None:

@@ -342,9 +342,9 @@ def test_an_obstacle_makes_no_energy_in_3d(backend_of: Callable) -> None:
 @pytest.mark.parametrize(
     ("right", "wrong"),
     [
-        # Forces along the normals at nodes, not at the points of the surface; the lever of a point reversed.
-        ("force[b] -= push * normal[b]", "force[b] -= push * facing_there[b]"),
-        ("weight *= 1.0 + ti.static", "weight *= 1.0 - ti.static"),
+        # Springs that act with the velocity before the step; the lever of a point reversed.
+        ("IMPLICIT = 0.5", "IMPLICIT = 0.0"),
+        ("weight * (1.0 + lever)", "weight * (1.0 - lever)"),
     ],
 )
 def test_a_planted_force_that_makes_energy_is_found(

@@ -27,8 +27,8 @@ class Phase:
     Attributes:
         name: name of the phase and of its body.
         over: the items of the loop: nodes in use ("nodes"), nodes on the planes of faces ("planes"), rows of nodes
-            ("rows"), the particles of a group ("particles"), rows of nodes per collider ("loads"), threads that process
-            nodes ("threads"), or runs ("runs").
+            ("rows"), the particles of a group ("particles"), rows of nodes per collider ("loads"), or
+            runs ("runs").
         stage: its place in the step; phases of a stage keep the order in which they are listed.
         group: index of the group of particles.
         adds: whether particles add to nodes; without atomics this is done colour by colour of pencils.
@@ -46,7 +46,7 @@ class Phase:
     """
 
     name: str
-    over: Literal["nodes", "planes", "rows", "particles", "loads", "threads", "runs"]
+    over: Literal["nodes", "planes", "rows", "particles", "loads", "runs"]
     stage: Stage
     group: int = 0
     adds: bool = False
@@ -70,11 +70,10 @@ class Feature:
 
     Attributes:
         begins: whether `begin_step` does anything.
-        threads: number of items of a run for phases over threads.
         noted: number of values of a run in a frame, see `note`, `read` and `tell`.
     """
 
-    begins, threads, noted = False, 0, 0
+    begins, noted = False, 0
 
     def write(self, scene: Scene, run: int = 0) -> None:
         """Set the constants of a run, and its state at time 0."""

@@ -47,7 +47,6 @@ TOLD = {
     "volume_ratio_max": "largest J",
     "volume_error": "lasting volume error",
     "contact_overlap": "deepest overlap of surfaces, cells",
-    "contact_gap": "largest gap that acts, cells",
     "neighbour_distance": "farthest neighbours, cells",
     "densest_cell": "densest cell / intended",
     "empty_cells": "empty cells inside",
@@ -329,7 +328,7 @@ def check_ledger(entries: Sequence[Entry], header: RunHeader, findings: FrameFin
         "volume_ratio_max": float(high.max()),
         "volume_error": _volume_error(numbers, of["volume_error"], findings),
         "collider_impulse": float(np.linalg.norm(impulse)) if took else None,
-        **{name: float(of[name].max()) if name in of else None for name in ("contact_overlap", "contact_gap")},
+        "contact_overlap": float(of["contact_overlap"].max()) if "contact_overlap" in of else None,
         **steps,
     }
 

@@ -229,7 +229,6 @@ def joined_row(rows: Sequence[LedgerRow], before: float) -> LedgerRow:
         courant_max=max(row.courant_max for row in rows),
         contact_overlap=max(row.contact_overlap for row in rows) if rows[0].contact_overlap is not None else None,
         contact_work=sum(row.contact_work for row in rows) if rows[0].contact_work is not None else None,
-        contact_gap=max(row.contact_gap for row in rows) if rows[0].contact_gap is not None else None,
         **{name: mean([getattr(row, name) for row in rows]) for name in LOADS},
     )
 

@@ -39,10 +39,9 @@ class LedgerRow:
             means since the previous frame of the momentum that it took from the material (0 at frame 0); per metre of
             depth in 2D. contact_force, contact_torque: for each pair of bodies of which one has a velocity field of its
             own, see `ContactTable.pairs`, means of the force on the first by the second, N, and about the domain's
-            origin, N m. contact_overlap, contact_gap: deepest overlap of surfaces that met, and their largest gap while
-            they acted on each other, since the previous frame, in cells; contact_work: work of contact on
-            what it parts since the previous frame, J: negative while its springs take up energy. These three are None
-            if no body separates.
+            origin, N m. contact_overlap: deepest overlap of surfaces that met since the previous frame, in
+            cells; contact_work: work of contact on what it parts since the previous frame, J: negative while its
+            springs take up energy. These two are None if no body separates.
         rigid_pose: centre of each free collider, m, and its angle, rad, or its unit quaternion, the real part first;
             rigid_motion: its velocity, m/s, and its angular velocity, rad/s. Its energies are included in those above,
                 its momenta are not. emitted, retired: particles that have entered from emitters so far, and that have
@@ -76,7 +75,6 @@ class LedgerRow:
     contact_torque: tuple[tuple[float, ...], ...] = ()
     contact_work: float | None = None
     contact_overlap: float | None = None
-    contact_gap: float | None = None
     rigid_pose: tuple[tuple[float, ...], ...] = ()
     rigid_motion: tuple[tuple[float, ...], ...] = ()
     emitted: int | None = None

@@ -62,7 +62,7 @@ class Features:
             self.rigid_contact = RigidContact(self.rigid, kind.faces, runs)
         if kind.layers.separate:
             how = {"on_cpu": on_cpu, "couples": bool(kind.colliders.free)}
-            self.contact = BodyContact(groups, orders, grid, kind.layers, runs, backend.threads, **how)
+            self.contact = BodyContact(groups, orders, grid, kind.layers, runs, **how)
         if kind.layers.by_points:
             self.colliders.support = grid.scheme.spline.nodes / 2
             fills = any(law.relaxes for law in kind.members)

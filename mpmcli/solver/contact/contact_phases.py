@@ -33,8 +33,12 @@ def contact_phases(groups: Sequence[ParticleArrays], *, serial: bool, couples: b
             for g in shown
         ),
         *lists,
+        *(
+            Phase("find_partners", "particles", "exchange", g, part=find_partners_part, item=find_partners_item)
+            for g in shown
+        ),
         *(rigid_phases() if couples else ()),
-        Phase("exchange", "threads", "exchange", part=exchange_part, item=exchange_item, words=PUSH),
+        Phase("exchange", "nodes", "exchange", part=exchange_part, item=exchange_item, words=PUSH),
         *[Phase("absorb", "runs", "exchange", part=absorb_part, item=absorb_item)] * couples,
     )
 
@@ -42,7 +46,7 @@ def contact_phases(groups: Sequence[ParticleArrays], *, serial: bool, couples: b
 def rigid_phases() -> tuple[Phase, ...]:
     """Return the phases that find the velocities of rigid bodies after their contact with bodies."""
     return (
-        Phase("weigh_rigid", "threads", "exchange", part=weigh_part, item=weigh_item, words="meet rigid bodies"),
+        Phase("weigh_rigid", "rows", "exchange", part=weigh_part, item=weigh_item, words="meet rigid bodies"),
         Phase("find_rigid", "runs", "exchange", part=find_rigid_part, item=find_rigid_item),
     )
 
@@ -58,16 +62,13 @@ class ContactNode:
     Attributes:
         grid, obstacles, step, w: grid restricted to such nodes, walls and colliders, step, and index of the run.
         gravity_step: change of velocity by gravity in the step, m/s.
-        thread: index of the thread of the batch, see `BodyContact.points`.
         node, index: the node, and its index in layer 0; variables of a kernel that may change.
         rigid: the rigid bodies of the run, None without any.
     """
 
-    def __init__(
-        self, at: object, grid: Grid, gravity_step: object, thread: object, node: object, index: object
-    ) -> None:
+    def __init__(self, at: object, grid: Grid, gravity_step: object, node: object, index: object) -> None:
         self.grid, self.obstacles, self.step, self.w = grid, obstacles_of(at), at.step, at.w
-        self.gravity_step, self.thread, self.node, self.index = gravity_step, thread, node, index
+        self.gravity_step, self.node, self.index = gravity_step, node, index
         self.rigid = at.features.rigid
 
     @ti.func
@@ -173,6 +174,25 @@ def find_surface_item(phases: ti.template(), at: ti.template()):
 
 
 @ti.func
+def find_partners_part(phases: ti.template(), at: ti.template()):
+    """Find what the surface points of the g-th group are inside of."""
+    (surfaces,) = ti.static((phases.device.features.contact.surfaces,))
+    (grid,) = ti.static(near_bodies(phases, at))
+    (obstacles,) = ti.static((obstacles_of(at),))
+    first, after = phases.places.part_of(at, surfaces.tile_count(grid, at.w))
+    for q in range(first, after):
+        surfaces.find_partners_in(at.g, grid, obstacles, at.w, q)
+
+
+@ti.func
+def find_partners_item(phases: ti.template(), at: ti.template()):
+    """Find what the surface point of a particle is inside of."""
+    (grid,) = ti.static(near_bodies(phases, at))
+    (obstacles,) = ti.static((obstacles_of(at),))
+    phases.device.features.contact.surfaces.find_partners(at.g, grid, obstacles, at.w, at.q)
+
+
+@ti.func
 def link_part(phases: ti.template(), at: ti.template()):
     """Insert the surface data of particles into the bins of their nodes, in order, on one thread."""
     if at.region == 0 and at.part == 0:
@@ -230,16 +250,16 @@ def exchange_in_part(phases: ti.template(), at: ti.template(), weighs: ti.templa
     (grid,) = ti.static(near_bodies(phases, at))
     first, after = rows_near_bodies(phases, grid, at)
     for row in range(first, after):
-        exchange_in_row(phases, at, row, at.w * ti.static(phases.regions) + at.t, weighs)
+        exchange_in_row(phases, at, row, weighs)
 
 
 @ti.func
-def exchange_in_row(phases: ti.template(), at: ti.template(), row: int, thread: int, weighs: ti.template()):
+def exchange_in_row(phases: ti.template(), at: ti.template(), row: int, weighs: ti.template()):
     """Visit the nodes of a row."""
     (grid,) = ti.static(near_bodies(phases, at))
     gravity_step, node = phases.gravity_of(at.step), grid.row_start(row)
     index = grid.linear_index(node)
-    (here,) = ti.static((ContactNode(at, grid, gravity_step, thread, node, index),))
+    (here,) = ti.static((ContactNode(at, grid, gravity_step, node, index),))
     for _ in range(grid.row_length(node)):
         phases.device.features.contact.exchange_all(here, weighs)
         node[ti.static(phases.dimension - 1)] += 1
@@ -248,13 +268,10 @@ def exchange_in_row(phases: ti.template(), at: ti.template(), row: int, thread: 
 
 @ti.func
 def weigh_item(phases: ti.template(), at: ti.template()):
-    """Sum what rigid bodies would take from some rows."""
+    """Sum what rigid bodies would take from a row."""
     (grid,) = ti.static(near_bodies(phases, at))
-    (contact,) = ti.static((phases.device.features.contact,))
-    row = at.q
-    while row < grid.row_count():
-        exchange_in_row(phases, at, row, at.w * contact.threads + at.q, True)
-        row += contact.threads
+    if at.q < grid.row_count():
+        exchange_in_row(phases, at, at.q, True)
 
 
 @ti.func
@@ -285,13 +302,10 @@ def absorb_item(phases: ti.template(), at: ti.template()):
 
 @ti.func
 def exchange_item(phases: ti.template(), at: ti.template()):
-    """Exchange momentum between bodies at some nodes, and with walls and colliders."""
+    """Exchange momentum between bodies at a node, and with walls and colliders."""
     (grid,) = ti.static(near_bodies(phases, at))
-    (contact,) = ti.static((phases.device.features.contact,))
-    gravity_step, q, thread = phases.gravity_of(at.step), at.q, at.w * contact.threads + at.q
-    while q < grid.box_nodes():
-        node = grid.box_node(q)
+    if at.q < grid.box_nodes():
+        gravity_step, node = phases.gravity_of(at.step), grid.box_node(at.q)
         index = grid.linear_index(node)
-        (here,) = ti.static((ContactNode(at, grid, gravity_step, thread, node, index),))
-        contact.exchange_all(here, False)
-        q += contact.threads
+        (here,) = ti.static((ContactNode(at, grid, gravity_step, node, index),))
+        phases.device.features.contact.exchange_all(here, False)

@@ -11,9 +11,9 @@ from mpmcli.scene.sampling import points_per_cell
 
 # Used instead of a coefficient of friction: both layers have the same velocity at common nodes.
 STICKS = -1.0
-# Numbers of a layer: P-wave modulus, Pa, sharpness, 1/m, normalisation of the sum over a flat surface, density, kg/m^3,
-# area of a surface point, m^(d-1), and from FRICTION on the coefficient of friction with each layer.
-MODULUS, SHARPNESS, FLAT, DENSITY, AREA, FRICTION = range(6)
+# Numbers of a layer: P-wave modulus, Pa, density, kg/m^3, area of a surface point, m^(d-1), and from FRICTION on the
+# coefficient of friction with each layer.
+MODULUS, DENSITY, AREA, FRICTION = range(4)
 
 
 @dataclass(frozen=True)

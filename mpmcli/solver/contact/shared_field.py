@@ -18,12 +18,10 @@ def stopped(contact: ti.template(), at: ti.template(), c: int, u: ti.template(),
     A share of their approach ends, which depends on how far the kernel of the nearest point of the surface is filled
     outside of the body. Deeper than DEEP all of u ends, and as far outside nothing.
     """
-    h, d, row = ti.static((at.grid.spacing, contact.dimension, at.w * contact.layers + c))
+    h, d = ti.static((at.grid.spacing, contact.dimension))
     change = -u
-    _n_a, n, counts, _slopes = contact.collect(at, 0, c)
-    if counts[1] > 0:
-        # Points of the second body have the opposite sign.
-        far = contact.distance_along(at, 1, counts[1], row, -n)
+    n, far, seen = surface_of(contact, at, c)
+    if seen > 0.0:
         share, approach = 1.0, ti.max(u.dot(n), 0.0)
         if far > -DEEP * h:
             # Light nodes would follow the field, which crushes the outermost particles of the body.
@@ -36,6 +34,35 @@ def stopped(contact: ti.template(), at: ti.template(), c: int, u: ti.template(),
         for b in ti.static(range(d)):
             change[b] = -share * (approach * n[b] + rub * along[b])
     return change
+
+
+@ti.func
+def surface_of(contact: ti.template(), at: ti.template(), c: int):
+    """Return the mean normal of body c at a node, the distance of the node from its surface, m, and their weight."""
+    grid, surfaces, h, d = ti.static((at.grid, contact.surfaces, at.grid.spacing, contact.dimension))
+    n, far, seen = ti.Vector.zero(float, d), 0.0, 0.0
+    for images in range(ti.static(grid.period.sets)):
+        there, exists = grid.period.image_from_inside(at.node, images)
+        if exists:
+            place = surfaces.place_of(grid, at.w, grid.linear_index(there))
+            for q in range(ti.static(grid.scheme.spline.nodes**d)):
+                before, inside = surfaces.stencil_before(grid, there, q)
+                if inside:
+                    for g in ti.static(surfaces.surfaced):
+                        p = surfaces.first[g][place - before]
+                        while p >= 0:
+                            if surfaces.shown[g][p] == c and not on_face(surfaces, at, g, p):
+                                weight, along = 1.0, 0.0
+                                for b in ti.static(range(d)):
+                                    way = ti.cast(there[b] - PAD, float) * h - surfaces.groups[g].x[p][b]
+                                    weight *= grid.scheme.spline.at(way * grid.inverse_spacing)
+                                    along += (way - surfaces.surface[g][p][d + b]) * surfaces.surface[g][p][b]
+                                seen += weight
+                                far += weight * along
+                                for b in ti.static(range(d)):
+                                    n[b] += weight * surfaces.surface[g][p][b]
+                            p = surfaces.following[g][p]
+    return n.normalized(SMALLEST), far / ti.max(seen, SMALLEST), seen
 
 
 @ti.func

@@ -3,8 +3,8 @@
 Each particle stores the depth D below the nearest face of its body at rest, and the normal N of that face. Under F they
 become d = D / |F^-T N| and n = F^-T N / |F^-T N|, and the point that was on the face is at x + D F N. Where plastic
 flow changes F, particles store d and n, and the point is x + d n. Particles with a surface point ("shown" particles)
-are inserted into bins, one for each node at which stencils begin. Contact with separating walls and colliders uses
-their exact distance.
+are inserted into bins, one for each node at which stencils begin. Each then finds its partners: the walls and
+colliders, by their exact distance, and the body that its point is inside of.
 """
 
 from collections.abc import Sequence
@@ -170,6 +170,13 @@ CRUSHED = 4.0
 EMPTY, CLOSED, HIDDEN = -1, -2, -1
 # Depth of particles that are never shown.
 BELOW_ALL = 1e30
+# Cells that a point may be from the nearest point of a body inside of which it is, and its largest depth that counts.
+NEAREST, DEEPEST = 1.0, 0.5
+# Products of the normals of a point and, opposite, of the body that it is inside of, up to which it does not count and
+# from which it counts in full: what slides past an edge meets its side with 0.
+FACES = (0.3, 0.6)
+# Depth of a point below the plane of another, over the particle spacing, from which the surface is convex there.
+CONVEX = 0.01
 # Fractions of the particle spacing: the offset of points from edges between equally near faces, which selects one face,
 # and the step of the finite difference for the normal.
 ASIDE, STEP = 1e-4, 1e-6
@@ -227,6 +234,8 @@ class BodySurfaces:
             particles, bin by bin; and number of reserved slots per run.
         shown: layer of each particle, or HIDDEN.
         surface: per particle, the normal n of the body, the way to its point of the surface, m, and dv/dn, 1/s.
+        partners: per particle, d of the things that its point is inside of, a layer, or the number of layers plus that
+            of an obstacle, or EMPTY; overlaps: the depth in each, m, times its normal there, inwards.
     """
 
     def __init__(
@@ -252,12 +261,15 @@ class BodySurfaces:
         self.present = ti.field(ti.i64, shape=runs * grid.node_count)
         self.met = ti.field(int, shape=runs * grid.node_count)
         self.first, self.following, self.shown, self.surface, self.end = {}, {}, {}, {}, {}
+        self.partners, self.overlaps = {}, {}
         for g in self.surfaced:
             room = groups[g].capacity
             self.first[g] = ti.field(int, shape=runs * grid.node_count)
             self.following[g], self.shown[g] = ti.field(int, shape=room), ti.field(int, shape=room)
             self.end[g] = ti.field(int, shape=orders[g].start.shape)
             self.surface[g] = ti.Vector.field(3 * d, float, shape=room)
+            self.partners[g] = ti.Vector.field(d, int, shape=room)
+            self.overlaps[g] = ti.Vector.field(d * d, float, shape=room)
         self.counted, self.rank, self.slots, self.reserved = {}, {}, {}, {}
         for g in () if on_cpu else self.surfaced:
             self.counted[g] = ti.field(int, shape=runs * grid.node_count)
@@ -640,3 +652,109 @@ class BodySurfaces:
                     if k + 1 < end:
                         following = self.slots[g][k + 1]
                     self.following[g][self.slots[g][k]] = following
+
+    # What surface points are inside of.
+
+    @ti.func
+    def find_partners_in(self, g: ti.template(), grid: ti.template(), obstacles: ti.template(), w: int, q: int):
+        """Find the partners of the particles of the g-th group in the q-th tile."""
+        tile, _ = self.tile_at(grid, self.orders[g], w, q)
+        for p in range(self.orders[g].start[tile], self.end[g][tile]):
+            self.find_partners(g, grid, obstacles, w, p)
+
+    @ti.func
+    def find_partners(self, g: ti.template(), grid: ti.template(), obstacles: ti.template(), w: int, p: int):
+        """Find the partners of a particle of the g-th group."""
+        d = ti.static(self.dimension)
+        if self.shown[g][p] != HIDDEN:
+            count, point = 0, self.groups[g].x[p]
+            for c in ti.static(range(d)):
+                point[c] += self.surface[g][p][d + c]
+            if ti.static(self.layers > int(self.shares) + 1):
+                # The other body has mass at the nearest node.
+                here = ti.cast(ti.round(point * grid.inverse_spacing), int) + PAD
+                for a in ti.static(grid.period.axes):
+                    beyond = here[a] - PAD
+                    cells = grid.period.cells[w][a]
+                    here[a] += ti.select(beyond < 0, cells, ti.select(beyond >= cells, -cells, 0))
+                place = self.bin_of(grid, w, here)
+                if place >= 0 and self.present[ti.max(place, 0)] > 255:
+                    layer, overlap = self.body_around(g, grid, w, p)
+                    if layer != HIDDEN:
+                        count = self.add_partner(g, p, count, layer, overlap)
+            for o in range(obstacles.count()):
+                distance, normal, _velocity, _friction = obstacles.at(o, point, 0.0)
+                if distance < 0.0 and count < d:
+                    count = self.add_partner(g, p, count, self.layers + o, distance * normal)
+            for k in ti.static(range(d)):
+                if k >= count:
+                    self.partners[g][p][k] = EMPTY
+
+    @ti.func
+    def add_partner(self, g: ti.template(), p: int, count: int, partner: int, overlap: ti.template()):
+        """Store a partner of a particle; return the number of its partners."""
+        for k in ti.static(range(self.dimension)):
+            if k == count:
+                self.partners[g][p][k] = partner
+                for c in ti.static(range(self.dimension)):
+                    self.overlaps[g][p][k * ti.static(self.dimension) + c] = overlap[c]
+        return count + 1
+
+    @ti.func
+    def body_around(self, g: ti.template(), grid: ti.template(), w: int, p: int):
+        """Return the layer of the body that the point of a particle is inside of, or HIDDEN, and the overlap.
+
+        It is inside by its depth below the plane of the nearest point of another body or, around an edge, of the one
+        that is farther out.
+        """
+        d, h = ti.static((self.dimension, grid.spacing))
+        # Around the place of a particle of the other body as deep below the same point.
+        across = self.groups[g].x[p]
+        for c in ti.static(range(d)):
+            across[c] += 2.0 * self.surface[g][p][d + c]
+        base, _ = grid.scheme.spline.stencil(across, grid.inverse_spacing)
+        layer, nearest, distance, facing = HIDDEN, (NEAREST * h) ** 2, 0.0, 0.0
+        place, normal, overlap = ti.Vector.zero(float, d), ti.Vector.zero(float, d), ti.Vector.zero(float, d)
+        for turn in range(2):
+            # Without any near point there is no edge.
+            for q in range(ti.select(turn == 0 or distance < 0.0, ti.static(3**d * grid.period.sets), 0)):
+                node, rest = base, q
+                for a in ti.static(range(d)):
+                    after = ti.raw_div(rest, 3)
+                    node[a] += rest - after * 3 - 1
+                    rest = after
+                there, exists = grid.period.image(node, rest)
+                bin_ = self.bin_of(grid, w, there)
+                if exists and bin_ >= 0:
+                    for other in ti.static(self.surfaced):
+                        r = self.first[other][bin_]
+                        while r >= 0:
+                            theirs = self.shown[other][r]
+                            n, way, apart, off = ti.Vector.zero(float, d), ti.Vector.zero(float, d), 0.0, 0.0
+                            for c in ti.static(range(d)):
+                                n[c] = self.surface[other][r][c]
+                                # From the point of the other, or its image, to that of the particle.
+                                way[c] = self.groups[g].x[p][c] - self.groups[other].x[r][c]
+                                way[c] += self.surface[g][p][d + c] - self.surface[other][r][d + c]
+                                way[c] += ti.cast(there[c] - node[c], float) * h
+                                apart += way[c] ** 2
+                                off += way[c] * n[c]
+                            takes = turn == 0 and theirs != self.shown[g][p] and apart < nearest
+                            if turn == 1 and theirs == layer and off > distance:
+                                takes = n.dot(way - place) < -CONVEX * self.band[w * self.layers + layer]
+                            if takes:
+                                layer, distance, facing = theirs, off, 0.0
+                                for c in ti.static(range(d)):
+                                    facing -= n[c] * self.surface[g][p][c]
+                                    normal[c] = n[c]
+                                    if turn == 0:
+                                        place[c] = way[c]
+                                if turn == 0:
+                                    nearest = apart
+                            r = self.following[other][r]
+        if distance >= 0.0 or facing <= ti.static(FACES[0]):
+            layer = HIDDEN
+        depth = ti.max(distance, -DEEPEST * h) * ti.min((facing - FACES[0]) / ti.static(FACES[1] - FACES[0]), 1.0)
+        for c in ti.static(range(d)):
+            overlap[c] = depth * normal[c]
+        return layer, overlap

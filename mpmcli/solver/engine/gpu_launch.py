@@ -344,7 +344,7 @@ SHIFT, FIRST, ROUND = range(3)
 # fill a large GPU, and elsewhere because software Vulkan takes half a microsecond for each thread.
 WORKERS, FEW_WORKERS = (2**17, 1), (2**13, 16)
 # Items of phases other than particles, see `Phase`.
-OVER = ("nodes", "planes", "rows", "loads", "runs", "threads")
+OVER = ("nodes", "planes", "rows", "loads", "runs")
 
 
 @ti.data_oriented
@@ -386,7 +386,6 @@ class GpuLaunch:
         self.averages = any(group.uses_f_bar for group in groups)
         loads = device.features.colliders and device.features.colliders.loads
         self.loads = loads.rows * loads.capacity if loads else 0
-        self.threads = max((feature.threads for feature in device.features), default=0)
         runs, self.widest = self.runs, max(entries(group) for group in groups)
         self.workers = max(1, GPU_WORKERS // runs)
         self.counts, self.numbers = self.phases.counts, self.phases.numbers
@@ -804,7 +803,7 @@ class GpuLaunch:
                     self.device.grid.box[2 * w + 1, a] = last - first + 1
         for k in range(3):
             self.reach[k] = 0
-        self.reach[3], self.reach[4], self.reach[5] = self.loads, 1, self.threads
+        self.reach[3], self.reach[4] = self.loads, 1
         for w in range(self.runs):
             nodes, planes, rows = self.phases.nodes_in_use(w)
             ti.atomic_max(self.reach[0], nodes)
