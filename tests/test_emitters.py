@@ -157,6 +157,21 @@ def test_a_jet_whose_rate_varies(backend_of: Callable[..., Backend]) -> None:
     assert rows[2].retired == 0 < rows[-1].retired
 
 
+@pytest.mark.parametrize("safety", [0.9, 0.3])
+def test_a_rope_hangs_on_its_nozzle(backend_of: Callable[..., Backend], safety: float) -> None:
+    """It grows by v t, and by rho g L^2 / (2 E'), E' = E / (1 - nu^2), at any step."""
+    modulus, density, speed, g = 3e4, 1000.0, 0.5, 9.81
+    jelly = {"law": "neo_hookean", "density": density, "youngs_modulus": modulus, "poissons_ratio": 0.3}
+    domain = {"size": [0.4, 0.8], "spacing": 0.02, "gravity": [0.0, -g]}
+    emitter = {"name": "rope", "material": jelly, "shape": box([0.16, 0.68], [0.24, 0.72]), "velocity": [0.0, -speed]}
+    asked = scene_of(domain=domain, time={"end": 0.5, "frames": 5, "safety": safety}, emitters=[emitter])
+    frames = [frame.of_present for frame, _ in build_run(asked, backend_of("f64", 1)).frames()]
+    first, frame = frames[1], frames[-1]
+    grown = first.position[:, 1].min() - frame.position[:, 1].min() - speed * (frame.time - first.time)
+    stretch = density * g * (1 - 0.3**2) / (2 * modulus) * speed**2 * (frame.time**2 - first.time**2)
+    assert grown == pytest.approx(stretch, rel=0.15)
+
+
 @pytest.mark.parametrize(
     ("sampling", "uneven", "mean", "drawn"), [("lattice", 2e-5, 2e-5, 2e-5), ("turned", 0.02, 5e-4, 4e-4)]
 )

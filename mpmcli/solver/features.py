@@ -17,7 +17,7 @@ from mpmcli.solver.engine.compiled_kind import CompiledKind
 from mpmcli.solver.grid.grid import Grid
 from mpmcli.solver.machine.backend import Backend
 from mpmcli.solver.particles.arrays import ParticleArrays
-from mpmcli.solver.particles.inflow import Emission
+from mpmcli.solver.particles.inflow import Emission, Nozzles
 from mpmcli.solver.particles.sort import TileOrder
 from mpmcli.solver.transfer.splines import PAD
 
@@ -70,6 +70,8 @@ class Features:
             self.points = ColliderPoints(self.colliders, grid.node_count, grid.layers, runs, **how)
         self.repulsion = ParticleContact(grid, groups[0], runs) if total and max(kind.bodies) > 1 else None
         self.emission = Emission(kind.inflow, d, runs) if kind.inflow.groups else None
+        solids = [e for e, g in enumerate(kind.inflow.groups) if kind.members[g].coherent]
+        self.nozzles = Nozzles(self.emission, solids) if solids else None
         for g, group in enumerate(groups if self.emission else ()):
             group.pour_from(self.emission, tuple(e for e, own in self.emission.members if own == g))
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from mpmcli.boundaries.feature import Feature, Phase
 from mpmcli.boundaries.rows import Rows
 from mpmcli.frames.frame import ACTIVE, BLOCKED, WAITING
 from mpmcli.quick_taichi import ti
@@ -20,6 +21,7 @@ from mpmcli.scene.domain import OPEN
 from mpmcli.scene.entry import varies
 from mpmcli.scene.sheets import Sheets, fastest_inflow, sheets_of
 from mpmcli.solver.particles.sort import entry_count
+from mpmcli.solver.transfer.splines import PAD
 
 # Delay before a layer of which half or more is blocked tries again, as a fraction of the time in which a layer enters.
 RETRY = 0.25
@@ -274,6 +276,35 @@ class Emission:
                     end += 1
             p += 1
         return end
+
+
+@ti.func
+def hold(at: ti.template(), node: ti.template(), _kick: float):
+    """Give a node in the nozzle of a solid, or beside it within a cell, the velocity of the emitter."""
+    emission, grid, h = ti.static((at.features.nozzles.emission, at.grid, at.grid.spacing))
+    x = ti.cast(node - PAD, float) * h
+    for e in ti.static(at.features.nozzles.emitters):
+        along, lead = emission.along(e, at.w, x), emission.lead[at.w, e]
+        inside = lead > 0.0 and along[0] > -2.0 * h and along[0] <= lead
+        for a in ti.static(range(1, emission.dimension)):
+            width = emission.cells[at.w, e][a] * emission.spacing[at.w, e][a]
+            beside = along[a] - emission.low[at.w, e][a]
+            inside = inside and beside > -h and beside < width + h
+        if inside:
+            index = grid.linear_index(node)
+            for a in ti.static(range(emission.dimension)):
+                grid.nodes[index][a] = emission.velocity[at.w, e][a]
+
+
+@ti.data_oriented
+class Nozzles(Feature):
+    """The nozzles of the emitters of solids, which hang on the nodes there; see docs/theory.md, 5.2."""
+
+    def __init__(self, emission: Emission, emitters: Sequence[int]) -> None:
+        self.emission, self.emitters = emission, tuple(emitters)
+
+    def phases(self, **_how: bool) -> tuple[Phase, ...]:
+        return (Phase("hold_nozzles", "nodes", "update", body=hold, words="hold solids in nozzles"),)
 
 
 @ti.func
