@@ -79,11 +79,11 @@ def soft_youngs_modulus(parameters: HenckyParameters, bounds: SceneBounds) -> fl
     """Return Young's modulus E, Pa, for which weight and speed in these bounds strain the volume by `compressibility`.
 
     The pressure of the deepest column and of the fastest flow is density (g H + v^2), with the largest density of all
-    bodies that can reach this one. The bulk modulus K = lambda + 2 mu / d (in 2D that of the plane) is proportional to
-    E.
+    bodies that can reach this one, and at least the load by colliders. The bulk modulus K = lambda + 2 mu / d (in 2D
+    that of the plane) is proportional to E.
     """
     speed = bounds.speed if bounds.speed > 0 else QUIET_SPEED
-    pressure = max(parameters.density, bounds.density) * (bounds.gravity * bounds.height + speed**2)
+    pressure = max(max(parameters.density, bounds.density) * (bounds.gravity * bounds.height + speed**2), bounds.load)
     one_pascal = parameters.model_copy(update={"youngs_modulus": 1.0})
     bulk = one_pascal.lame_lambda + 2 * one_pascal.shear_modulus / bounds.dimension
     return min(max(pressure / (parameters.compressibility * bulk), 1 / LARGEST), LARGEST)

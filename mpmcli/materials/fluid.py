@@ -66,7 +66,7 @@ class WeaklyCompressibleParameters(MaterialParameters):
     bulk_modulus: Positive | Literal["auto"] = Field(
         "auto",
         description='Bulk modulus K = density c^2, Pa; "auto" picks the softest that keeps the density '
-        "variation under `compressibility` at the highest speed that can reach the body.",
+        "variation under `compressibility` at the highest speed and load that can reach the body.",
     )
     compressibility: compressibility_of("bulk_modulus") = 0.01
 
@@ -106,8 +106,11 @@ class FluidParameters(WeaklyCompressibleParameters):
         """Whether J follows the density of the grid; a fluid with suction keeps its volume."""
         return self.tension_cutoff and self.volume_correction
 
+    def shear_stress_at(self, rate: float, pressure: float) -> float:
+        return self.viscosity * rate
+
     def resolve(self, bounds: SceneBounds) -> tuple[Self, list[str]]:
-        """Replace "auto" by K = density v^2 / compressibility, where v is the highest speed that can reach the body."""
+        """Replace "auto" by the softest bulk modulus for the speed and the load that can reach the body."""
         if self.bulk_modulus != "auto":
             return self, []
         modulus, note = soft_bulk_modulus(self.density, self.compressibility, bounds)
@@ -127,23 +130,31 @@ class FluidParameters(WeaklyCompressibleParameters):
         return np.where(J > CRUSHED, J, np.nan)
 
 
-def soft_bulk_modulus(density: float, compressibility: float, bounds: SceneBounds) -> tuple[float, str]:
-    """Return K = density v^2 / compressibility, Pa, and a sentence that states it; v is the highest speed.
+def soft_bulk_modulus(
+    density: float, compressibility: float, bounds: SceneBounds, strength: float = 0.0
+) -> tuple[float, str]:
+    """Return K = p / compressibility, Pa, and a sentence that states it.
 
-    The density is the largest of all bodies that can reach the fluid, because a denser one may press on it.
+    The pressure p is the largest of density v^2, with v the highest speed, of the load by colliders, and of the
+    `strength`, Pa, under which the material at rest yields. The density is the largest of all bodies that can reach the
+    fluid, because a denser one may press on it.
 
     The density of weakly compressible flow varies by v^2/c^2 (Monaghan 1994). A column released without
     compression reaches a pressure of 2 density g H = density v^2, the same bound. In a head-on impact on fluid or a
     wall the pressure briefly reaches density c v (water hammer), which varies the density by v/c.
     """
     speed = bounds.speed if bounds.speed > 0 else QUIET_SPEED
-    modulus = min(max(max(density, bounds.density) * speed**2 / compressibility, 1 / LARGEST), LARGEST)
-    note = (
-        f"bulk_modulus = {modulus:.4g} Pa (sound speed {np.sqrt(modulus / density):.4g} m/s) lets the density "
-        f"of smooth flow vary by {100 * compressibility:.3g} % at the highest speed, {speed:.4g} m/s; "
-        f"a hard impact at that speed reaches {100 * np.sqrt(compressibility):.3g} %"
+    dynamic = max(density, bounds.density) * speed**2
+    pressure = max(dynamic, bounds.load, strength)
+    modulus = min(max(pressure / compressibility, 1 / LARGEST), LARGEST)
+    said = f"bulk_modulus = {modulus:.4g} Pa (sound speed {np.sqrt(modulus / density):.4g} m/s) lets the density "
+    if pressure > dynamic:
+        cause = "with which colliders push the material" if pressure == bounds.load else "under which it yields"
+        return modulus, f"{said}vary by {100 * compressibility:.3g} % at {pressure:.4g} Pa, the pressure {cause}"
+    impact = f"a hard impact at that speed reaches {100 * np.sqrt(compressibility):.3g} %"
+    return modulus, (
+        f"{said}of smooth flow vary by {100 * compressibility:.3g} % at the highest speed, {speed:.4g} m/s; {impact}"
     )
-    return modulus, note
 
 
 @ti.func

@@ -123,6 +123,10 @@ class SandParameters(HenckyParameters):
             raise flaw(f"must be at most {STEEPEST_3D:g} degrees in 3D, {_PULLED}; found {value:g}")
         return value
 
+    def shear_stress_at(self, rate: float, pressure: float) -> float:
+        angle = math.radians(self.friction_angle)
+        return pressure * math.sin(angle) + self.cohesion * math.cos(angle)
+
     def resolve(self, bounds: SceneBounds) -> tuple[Self, list[str]]:
         """Replace "auto" by the softest modulus that the scene allows, at most that of real sand."""
         if self.youngs_modulus != "auto":

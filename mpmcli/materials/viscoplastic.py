@@ -18,6 +18,8 @@ BULK_MODULUS, SHEAR_MODULUS, YIELD_STRESS, CONSISTENCY, FLOW_INDEX, LARGEST_J = 
 
 # Largest elastic shear strain at yield for shear_modulus = "auto".
 YIELD_STRAIN = 0.05
+# Pressure under a smooth punch over the yield stress, by slip lines (Prandtl 1920).
+PUNCH = 2 + math.pi
 # Dilation, as ln J, that reduces the shear stress of a torn particle to 1/e.
 TEAR_STRAIN = 0.1
 # A particle with J below the first is treated as inverted; with a mean of the isochoric b above the second, as flat.
@@ -51,11 +53,14 @@ class ViscoplasticParameters(WeaklyCompressibleParameters):
         "and it forgets its shear stress as it opens. Pastes hang together, and swell where they cannot.",
     )
 
+    def shear_stress_at(self, rate: float, pressure: float) -> float:
+        return self.yield_stress + self.consistency * rate**self.flow_index
+
     def resolve(self, bounds: SceneBounds) -> tuple[Self, list[str]]:
         """Replace "auto" by the bulk modulus of the fluid, and by a shear modulus of small strain at yield."""
         bulk, shear, notes = self.bulk_modulus, self.shear_modulus, []
         if bulk == "auto":
-            bulk, note = soft_bulk_modulus(self.density, self.compressibility, bounds)
+            bulk, note = soft_bulk_modulus(self.density, self.compressibility, bounds, PUNCH * self.yield_stress)
             notes.append(note)
         if shear == "auto":
             shear = min(max(bulk / 4, self.yield_stress / YIELD_STRAIN), LARGEST)

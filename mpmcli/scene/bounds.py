@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mpmcli.scene.displaced_flow import displaced_flow
 from mpmcli.scene.entry import Entry, value_of, varies
 from mpmcli.scene.expression import INITIAL, POSITION, VELOCITY, Apply, Expression, Tree, bounds_of, names_in
 from mpmcli.scene.material import SceneBounds
@@ -231,8 +232,9 @@ def scene_bounds(scene: Scene, sources: Sequence[Body | Emitter] | None = None) 
     highest matter above the lowest point of the domain, both measured against gravity; v0 alone where
     there is no gravity. height = H, or the largest extent of the matter where there is no gravity.
 
-    The speed is at least that of the fastest wall and of the fastest point of a collider. Along a periodic axis there
-    is no lowest point: gravity along it adds its impulse over the run and no height.
+    The speed is at least that of the fastest wall, of the fastest point of a collider, and of the material that
+    colliders push through what is open; the load is the pressure with which they do (`displaced_flow`). Along a
+    periodic axis there is no lowest point: gravity along it adds its impulse over the run and no height.
 
     For time-dependent gravity, g is the largest magnitude and H the largest of any instant; the impulse also bounds the
     speed. Forces of magnitude a add min(2 a L, I^2) to the square of the speed, L the largest extent of the domain and
@@ -253,7 +255,10 @@ def scene_bounds(scene: Scene, sources: Sequence[Body | Emitter] | None = None) 
         )
     g = pull.largest
     pushed_by = [collider.fastest(scene.domain, scene.time.end) for collider in scene.colliders]
-    initial = max([scene.domain.wall_speed, *pushed_by, *(highest_speed(body, scene.time.end) for body in sources)])
+    flow = displaced_flow(scene)
+    initial = max(
+        [scene.domain.wall_speed, flow.speed, *pushed_by, *(highest_speed(body, scene.time.end) for body in sources)]
+    )
     closed = ~np.array(scene.domain.periodic)
     # Without material the rigid bodies are what falls.
     forms = [body.shape.form for body in sources] or [one.form for one in scene.colliders if one.free]
@@ -269,14 +274,13 @@ def scene_bounds(scene: Scene, sources: Sequence[Body | Emitter] | None = None) 
     if not closed.all():
         initial += max(float(np.linalg.norm(gravity[~closed])) for gravity in gravities) * scene.time.end
     pushed = min(2 * push.largest * max(scene.domain.size), push.impulse * push.impulse)
-    return SceneBounds(
-        dimension=scene.dimension,
-        spacing=scene.domain.spacing,
-        gravity=g + push.largest,
-        speed=float(np.sqrt(initial * initial + fallen + pushed)) + sum(abs(one.strength) for one in scene.impulses),
-        height=height,
-        density=max((body.material.density for body in sources), default=0.0),
-    )
+    weighted = g + push.largest
+    speed = float(np.sqrt(initial * initial + fallen + pushed)) + sum(abs(one.strength) for one in scene.impulses)
+    density = max((body.material.density for body in sources), default=0.0)
+    pressure = density * (weighted * height + speed * speed)
+    resisting = max((body.material.shear_stress_at(flow.rate, pressure) for body in sources), default=0.0)
+    load = flow.pressure(density, resisting)
+    return SceneBounds(scene.dimension, scene.domain.spacing, weighted, speed, height, density, load)
 
 
 def highest_speed(body: Body | Emitter, end: float = math.inf) -> float:

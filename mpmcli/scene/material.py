@@ -91,6 +91,7 @@ class SceneBounds:
         speed: highest speed that any particle can reach, m/s, from initial speeds and fall height.
         height: extent of the matter along gravity that can press on its lowest point, m.
         density: largest density at rest of any body, kg/m^3, for the pressure on the others.
+        load: largest pressure with which colliders push material that resists shear through what is open, Pa.
     """
 
     dimension: int
@@ -99,6 +100,7 @@ class SceneBounds:
     speed: float
     height: float
     density: float = 0.0
+    load: float = 0.0
 
 
 class Internal(NamedTuple):
@@ -159,6 +161,10 @@ class MaterialParameters(BaseModel):
     def resolve(self, bounds: SceneBounds) -> tuple[Self, list[str]]:
         """Return these parameters with every "auto" replaced, and a sentence for each choice."""
         return self, []
+
+    def shear_stress_at(self, rate: float, pressure: float) -> float:
+        """Return the shear stress, Pa, at which it flows at a shear rate, 1/s, and a pressure, Pa; 0 of solids."""
+        return 0.0
 
     def volume_ratio_under(self, load: np.ndarray) -> np.ndarray:
         """Return the J, (n,), at which the material at rest has J p = `load`, (n,), Pa; nan where there is none."""
