@@ -263,6 +263,59 @@ def test_a_solid_is_hit_as_fast_as_it_falls() -> None:
     assert f"at {math.sqrt(10.0):.3g} m/s" in one.what
 
 
+@pytest.mark.parametrize(
+    ("collider", "speed"),
+    [
+        ({"velocity": [8.0, 0.0], "density": 7800.0}, 8.0),
+        ({"velocity": [8.0, 0.0]}, 8.0),
+        ({"keyframes": [{"time": 0.0}, {"time": 0.1, "offset": [0.8, 0.0]}]}, 8.0),
+        # It misses, recedes, or is slow.
+        ({"velocity": [0.0, 8.0], "density": 7800.0}, None),
+        ({"velocity": [-8.0, 0.0]}, None),
+        ({"velocity": [1.0, 0.0]}, None),
+    ],
+    ids=["rigid", "velocity", "keyframes", "misses", "recedes", "slow"],
+)
+@pytest.mark.parametrize("law", ["solid", "fluid"])
+def test_what_is_hit_by_a_collider_faster_than_its_waves(collider: dict, speed: float | None, law: str) -> None:
+    """c is sqrt(K / density) of a fluid, and of a solid that at rest: sqrt(E / (2 density)) for nu = 0."""
+    soft = SOLID | {"youngs_modulus": 4e4, "poissons_ratio": 0.0}
+    material = soft if law == "solid" else FLUID | {"bulk_modulus": 2e4}
+    ball = {"name": "ball", "shape": {"ball": {"center": [0.2, 0.5], "radius": 0.1}}, **collider}
+    findings = found(
+        "impact-speed",
+        material=material,
+        shape=box([0.5, 0.25], [0.75, 0.75]),
+        domain={"size": [1.0, 1.0], "cells": [32, 32], "gravity": [0.0, 0.0]},
+        time={"end": 0.2, "frames": 1},
+        colliders=[ball],
+    )
+    if law == "fluid" and speed is None:
+        # Any part of a liquid may meet any collider.
+        return
+    assert [one.body for one in findings] == ["block"] * (speed is not None)
+    if speed:
+        assert f"at {speed:.3g} m/s" in findings[0].what and "faster than its waves" in findings[0].what
+        if law == "solid":
+            c = math.sqrt(4e4 / 2 / 1000.0)
+            assert findings[0].value == pytest.approx(speed / c)
+
+
+def test_what_falls_onto_a_rigid_body_or_a_plane() -> None:
+    """At sqrt(2 g H), both ways; a rigid body that lies on it does not hit it."""
+    soft = SOLID | {"youngs_modulus": 2e4, "poissons_ratio": 0.0}
+    plane = {"name": "ground", "shape": {"plane": {"point": [0.0, 0.1], "normal": [0.0, 1.0]}}}
+    (one,) = found("impact-speed", material=soft, shape=box([0.25, 0.6], [0.5, 0.75]), colliders=[plane])
+    assert one.value == pytest.approx(math.sqrt(2 * 10 * 0.6) / math.sqrt(2e4 / 2 / 1000.0), rel=0.1)
+    for low, fires in ((0.7, True), (0.25, False)):
+        stone = {"name": "stone", "density": 3000.0, "shape": box([0.3, low], [0.5, low + 0.2])}
+        hits = found("impact-speed", material=soft, shape=box([0.25, 0.0], [0.5, 0.25]), colliders=[stone])
+        assert bool(hits) == fires
+        if fires:
+            speed = math.sqrt(2 * 10 * (0.7 - 0.25))
+            assert '"stone"' in hits[0].what and hits[0].value == pytest.approx(speed / math.sqrt(1e1), rel=0.1)
+
+
 @pytest.mark.parametrize(("factor", "fires"), [(0.98, False), (1.02, True)])
 def test_a_solid_that_cannot_carry_itself(factor: float, fires: bool) -> None:
     """density g H over E above 0.3, for what has a shape to lose."""

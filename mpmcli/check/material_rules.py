@@ -8,6 +8,7 @@ import numpy as np
 from mpmcli.check.facts import BodyFacts, SceneFacts
 from mpmcli.check.finding import Finding
 from mpmcli.check.geometry import touched_walls
+from mpmcli.check.strikes import strike_speed
 from mpmcli.plain_text import plain_number
 from mpmcli.scene.bounds import body_points
 from mpmcli.scene.domain import PASSED, STICKING
@@ -46,18 +47,21 @@ def material_findings(facts: SceneFacts) -> Iterator[Finding]:
 def _impact(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
     """Yield impact speeds near the wave speed; in scenes with flow any body may be hit at the largest speed."""
     speed = facts.bounds.speed if facts.flowing else body.arrival.speed
-    if body.wave_speed == 0 or speed <= FAST * body.wave_speed:
+    struck, name = strike_speed(facts.scene, body.body, body.arrival.time)
+    by, speed, waves = f' by "{name}"' if struck > speed else "", max(speed, struck), body.wave_speed
+    if waves == 0 or speed <= FAST * waves:
         return
-    ratio = speed / body.wave_speed
+    if body.body.material.elastic:
+        # It stiffens only as it is crushed.
+        waves = math.sqrt(body.stiffness / (body.law.dimension * body.body.material.density))
+    ratio = speed / waves
     if ratio > SUPERSONIC:
         said = "faster than its waves: impacts are shocks, smeared over some cells, and may crush it to nothing"
     elif body.law.deformation == "J":
         said = f"{ratio:.2g} of its speed of sound: its density varies by up to {100 * ratio**2:.0f} % in smooth flow"
     else:
         said = f"{ratio:.2g} of its wave speed: impacts crush it by about as much"
-    what = (
-        f'Body "{body.name}" may be hit at {speed:.3g} m/s and its waves run at {body.wave_speed:.3g} m/s, so {said}.'
-    )
+    what = f'Body "{body.name}" may be hit{by} at {speed:.3g} m/s and its waves run at {waves:.3g} m/s, so {said}.'
     stiffness = body.law.first_set(body.body.material, body.law.stiffness_parameters)
     name, value = stiffness or ("its stiffness", body.stiffness)
     needed = value * (ratio / FAST) ** 2
