@@ -159,6 +159,8 @@ def test_a_piston_makes_sand_stiffer() -> None:
     flow = displaced_flow(pushed)
     assert bounds.load == pytest.approx(flow.strain * pressure / 2 + JET * 1600.0 * (flow.speed**2 - U**2))
     material = pushed.bodies[0].material
+    (said,) = material.model_copy(update={"youngs_modulus": "auto"}).resolve(bounds)[1]
+    assert f"at {bounds.load:.4g} Pa, the pressure with which colliders push the material" in said
     bulk = material.lame_lambda + material.shear_modulus
     assert bounds.load > pressure and bulk == pytest.approx(bounds.load / material.compressibility)
 

@@ -75,18 +75,21 @@ class HenckyParameters(ElasticParameters):
     compressibility: Compressibility = 0.01
 
 
-def soft_youngs_modulus(parameters: HenckyParameters, bounds: SceneBounds) -> float:
-    """Return Young's modulus E, Pa, for which weight and speed in these bounds strain the volume by `compressibility`.
+def soft_youngs_modulus(parameters: HenckyParameters, bounds: SceneBounds) -> tuple[float, str]:
+    """Return Young's modulus E, Pa, for which the load strains the volume by `compressibility`, and words for the load.
 
     The pressure of the deepest column and of the fastest flow is density (g H + v^2), with the largest density of all
     bodies that can reach this one, and at least the load by colliders. The bulk modulus K = lambda + 2 mu / d (in 2D
     that of the plane) is proportional to E.
     """
     speed = bounds.speed if bounds.speed > 0 else QUIET_SPEED
-    pressure = max(max(parameters.density, bounds.density) * (bounds.gravity * bounds.height + speed**2), bounds.load)
+    pressure = max(parameters.density, bounds.density) * (bounds.gravity * bounds.height + speed**2)
+    said = f"under a column of {bounds.height:.4g} m and at the highest speed, {bounds.speed:.4g} m/s"
+    if bounds.load > pressure:
+        pressure, said = bounds.load, f"at {bounds.load:.4g} Pa, the pressure with which colliders push the material"
     one_pascal = parameters.model_copy(update={"youngs_modulus": 1.0})
     bulk = one_pascal.lame_lambda + 2 * one_pascal.shear_modulus / bounds.dimension
-    return min(max(pressure / (parameters.compressibility * bulk), 1 / LARGEST), LARGEST)
+    return min(max(pressure / (parameters.compressibility * bulk), 1 / LARGEST), LARGEST), said
 
 
 class HenckyLaw(Law):

@@ -131,10 +131,9 @@ class SandParameters(HenckyParameters):
         """Replace "auto" by the softest modulus that the scene allows, at most that of real sand."""
         if self.youngs_modulus != "auto":
             return self, []
-        soft = soft_youngs_modulus(self, bounds)
+        soft, under = soft_youngs_modulus(self, bounds)
         modulus = min(max(min(soft, REAL_MODULUS), MODULUS_PER_STRENGTH * self.cohesion), LARGEST)
         varies = f"the density vary by {100 * self.compressibility * soft / modulus:.3g} %"
-        under = f"under a column of {bounds.height:.4g} m and at the highest speed, {bounds.speed:.4g} m/s"
         if modulus < soft:
             said = f"youngs_modulus = {modulus:.4g} Pa, that of real sand, lets {varies} {under}"
         elif modulus > soft:

@@ -59,14 +59,13 @@ class VonMisesParameters(HenckyParameters):
         """Replace "auto" by the softest modulus that the scene allows and whose yield strain is small."""
         if self.youngs_modulus != "auto":
             return self, []
-        soft = soft_youngs_modulus(self, bounds)
+        soft, under = soft_youngs_modulus(self, bounds)
         modulus = min(max(soft, MODULUS_PER_STRENGTH * self.yield_stress), LARGEST)
         if modulus > soft:
             said = f"youngs_modulus = {modulus:.4g} Pa lets it yield at a strain of {100 / MODULUS_PER_STRENGTH:.3g} %"
         else:
             said = (
-                f"youngs_modulus = {modulus:.4g} Pa lets the density vary by {100 * self.compressibility:.3g} % under "
-                f"a column of {bounds.height:.4g} m and at the highest speed, {bounds.speed:.4g} m/s"
+                f"youngs_modulus = {modulus:.4g} Pa lets the density vary by {100 * self.compressibility:.3g} % {under}"
             )
         return self.model_copy(update={"youngs_modulus": modulus}), [said]
 
