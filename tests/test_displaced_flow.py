@@ -174,3 +174,21 @@ def test_a_paste_is_stiff_against_a_punch() -> None:
         bodies=[{"name": "body", "material": paste, "shape": box([0.2, 0.0], [0.8, 0.5])}],
     )
     assert scene.bodies[0].material.bulk_modulus == pytest.approx((2 + math.pi) * 1e4 / 0.02)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_a_rigid_body_counts_with_its_weight(d: int) -> None:
+    """K (1 - J) is density g H of a weight that lies on the liquid; one that a hinge holds does not count."""
+    gravity = [0.0] * (d - 1) + [-9.81]
+    weight = {"name": "weight", "density": 7800.0, "shape": box([0.1] * (d - 1) + [0.2], [0.9] * (d - 1) + [0.7])}
+    hinge = {"joint": {"type": "hinge"}}
+    for one, load in ((weight, 7800.0 * 9.81 * 0.5), (weight | hinge, 0.0)):
+        scene = scene_of(
+            domain={"size": [1.0] * d, "spacing": 0.1, "gravity": gravity},
+            time={"end": 1.0, "frames": 1},
+            bodies=[{"name": "body", "material": WATER, "shape": box([0.0] * d, [1.0] * (d - 1) + [0.2])}],
+            colliders=[one],
+        )
+        material = scene.bodies[0].material
+        assert scene_bounds(scene).load == pytest.approx(load)
+        assert material.bulk_modulus == pytest.approx(max(load, 1000.0 * 2 * 9.81 * 0.2) / material.compressibility)

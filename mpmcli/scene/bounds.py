@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mpmcli.scene.colliders import Collider
 from mpmcli.scene.displaced_flow import displaced_flow
 from mpmcli.scene.entry import Entry, value_of, varies
 from mpmcli.scene.expression import INITIAL, POSITION, VELOCITY, Apply, Expression, Tree, bounds_of, names_in
@@ -233,8 +234,9 @@ def scene_bounds(scene: Scene, sources: Sequence[Body | Emitter] | None = None) 
     there is no gravity. height = H, or the largest extent of the matter where there is no gravity.
 
     The speed is at least that of the fastest wall, of the fastest point of a collider, and of the material that
-    colliders push through what is open; the load is the pressure with which they do (`displaced_flow`). Along a
-    periodic axis there is no lowest point: gravity along it adds its impulse over the run and no height.
+    colliders push through what is open; the load is the pressure with which they do (`displaced_flow`), or that of the
+    weight of rigid bodies. Along a periodic axis there is no lowest point: gravity along it adds its impulse over the
+    run and no height.
 
     For time-dependent gravity, g is the largest magnitude and H the largest of any instant; the impulse also bounds the
     speed. Forces of magnitude a add min(2 a L, I^2) to the square of the speed, L the largest extent of the domain and
@@ -279,8 +281,16 @@ def scene_bounds(scene: Scene, sources: Sequence[Body | Emitter] | None = None) 
     density = max((body.material.density for body in sources), default=0.0)
     pressure = density * (weighted * height + speed * speed)
     resisting = max((body.material.shear_stress_at(flow.rate, pressure) for body in sources), default=0.0)
-    load = flow.pressure(density, resisting)
+    # What a joint or a fixed axis may bear does not count.
+    heavy = [one for one in scene.colliders if one.free and not (one.fixed or one.joint)]
+    load = max([flow.pressure(density, resisting), *(_weight(one, gravities) for one in heavy)])
     return SceneBounds(scene.dimension, scene.domain.spacing, weighted, speed, height, density, load)
+
+
+def _weight(one: Collider, gravities: Sequence[np.ndarray]) -> float:
+    """Return the weight of a rigid body over the area of its bounding box across gravity, Pa; the largest one."""
+    extent = np.ptp(one.form.bounds(), axis=0)
+    return max(float((np.abs(gravity) * extent).max() * one.moments.mass / extent.prod()) for gravity in gravities)
 
 
 def highest_speed(body: Body | Emitter, end: float = math.inf) -> float:
