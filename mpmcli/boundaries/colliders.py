@@ -655,6 +655,8 @@ class ColliderMotion(Feature):
     Attributes:
         moving: their indices.
         rates: means in the step of the velocity, m/s, and the spin, rad/s. The host sets constant rates.
+        work: on the CPU, what the work on the material since the last frame is more than the loads so far times
+            `before`, the rates of the last step, J.
     """
 
     begins = True
@@ -667,7 +669,11 @@ class ColliderMotion(Feature):
         # Position of the pivot relative to the lower corner, m, and the angle, rad.
         self.pose = double_field(n, d + 1)
         self.axis = double_field(n, entries=(3,))
-        self._rows = Rows(self.pose, self.axis, self.rates)
+        booked = ()
+        if colliders.on_cpu:
+            self.noted, self.work, self.before = 1, double_field(n), double_field(n, d + 1)
+            booked = self.work, self.before
+        self._rows = Rows(self.pose, self.axis, self.rates, *booked)
 
     def write(self, scene: Scene, run: int = 0) -> None:
         """Set the motions of a run, at time 0."""
@@ -676,16 +682,60 @@ class ColliderMotion(Feature):
             motion = scene.colliders[k].motion
             place = np.array(motion.pivot) + motion.offset - np.array(scene.domain.origin)
             rates = [float(evaluate(tree, {"t": 0.0})) for tree in motion.rates]
-            rows.append(([*place, motion.angle], motion.axis, rates))
+            rows.append([[*place, motion.angle], motion.axis, rates] + [0.0, [0.0] * len(rates)] * self.noted)
         self._rows.write_all(run * len(self.moving), rows)
 
     def saved(self) -> dict[str, ti.Field]:
-        return {"colliders.pose": self.pose}
+        booked = {"colliders.work": self.work, "colliders.before": self.before} if self.noted else {}
+        return {"colliders.pose": self.pose} | booked
+
+    @ti.func
+    def note(self, run: int, frame: int, column: int, frame_stats: ti.template()):
+        work = ti.cast(0, ti.f64)
+        for m, k in ti.static(enumerate(self.moving)):
+            row = run * ti.static(len(self.moving)) + m
+            work += self.work[row] - self.power(row, self.colliders.loads.total(run, k), self.before)
+            self.work[row] = 0
+        frame_stats[run, frame, column] = work
+
+    def tell(self, values: np.ndarray, _run: int, found: MutableMapping[str, np.ndarray]) -> None:
+        if self.noted:
+            found["collider_work"] = values[:, 0]
+
+    @ti.func
+    def power(self, row: int, load: ti.template(), rates: ti.template()):
+        """Return the product of a load, N s and N m s, with rates, J."""
+        d = ti.static(self.dimension)
+        result = ti.cast(0, ti.f64)
+        for a in ti.static(range(d)):
+            result += load[a] * rates[row, a]
+        if ti.static(d == 2):
+            result += load[2] * rates[row, 2]
+        else:
+            for a in ti.static(range(3)):
+                result += load[3 + a] * self.axis[row][a] * rates[row, 3]
+        return result
 
     @ti.func
     def begin_step(self, phases: ti.template(), run: ti.template(), _step: ti.template()):
         phases.device.values.set_motions(run.w, self, run.time, run.time + run.dt)
+        if ti.static(self.noted > 0):
+            self.book(run.w)
         self.advance(run.w, run.dt)
+
+    @ti.func
+    def book(self, run: int):
+        """Begin a step: take the work of the loads so far with the rates of this step, by partial summation."""
+        for m, k in ti.static(enumerate(self.moving)):
+            row, changed = run * ti.static(len(self.moving)) + m, False
+            for a in ti.static(range(self.dimension + 1)):
+                changed = changed or self.rates[row, a] != self.before[row, a]
+            if changed:
+                load = self.colliders.loads.total(run, k)
+                gained = self.power(row, load, self.rates) - self.power(row, load, self.before)
+                self.work[row] = self.work[row] + gained
+                for a in ti.static(range(self.dimension + 1)):
+                    self.before[row, a] = self.rates[row, a]
 
     @ti.func
     def advance(self, run: int, dt: ti.f64):

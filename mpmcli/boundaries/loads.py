@@ -52,6 +52,15 @@ class Loads:
                 frame_stats[run, frame, column + k * self.width + a] = total[a]
 
     @ti.func
+    def total(self, run: int, k: int):
+        """Return the load of receiver k of a run since the last frame."""
+        result = ti.Vector.zero(ti.f64, self.width)
+        for row in range(self.rows):
+            for a in ti.static(range(self.width)):
+                result[a] += self.taken[(run * self.rows + row) * self.capacity + k][a]
+        return result
+
+    @ti.func
     def row_of(self, node: ti.template()):
         """Return the index of the row of a node."""
         row = 0

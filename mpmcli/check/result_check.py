@@ -266,7 +266,9 @@ def check_ledger(entries: Sequence[Entry], header: RunHeader, findings: FrameFin
     # With rigid bodies that move freely, colliders also do work on these.
     balanced = not header.driven and (not header.moved or _knows_work(rows, header))
     work = unsure = np.zeros(len(rows))
-    if balanced and header.moved:
+    if balanced and header.moved and "collider_work" in of:
+        work = np.cumsum(of["collider_work"])
+    elif balanced and header.moved:
         work, unsure = work_of_colliders(rows, header.colliders), unsure_work(rows, header.colliders)
     energies = of["kinetic"], of["potential"] - of["mass"] * lowest_potential(header), of["elastic"]
     lost, growth = energy_change(*energies, work)[1], energy_change(*energies, work + unsure)[0]

@@ -219,7 +219,7 @@ def joined_row(rows: Sequence[LedgerRow], before: float) -> LedgerRow:
     def mean(vectors: Sequence[tuple[tuple[float, ...], ...]]) -> tuple[tuple[float, ...], ...]:
         return tuple(map(tuple, np.average(np.array(vectors), axis=0, weights=spans).tolist()))
 
-    smallest = min(rows, key=lambda row: row.step_min)
+    smallest, works = min(rows, key=lambda row: row.step_min), ("collider_work", "contact_work")
     return replace(
         rows[-1],
         steps=sum(row.steps for row in rows),
@@ -228,7 +228,7 @@ def joined_row(rows: Sequence[LedgerRow], before: float) -> LedgerRow:
         limit=smallest.limit,
         courant_max=max(row.courant_max for row in rows),
         contact_overlap=max(row.contact_overlap for row in rows) if rows[0].contact_overlap is not None else None,
-        contact_work=sum(row.contact_work for row in rows) if rows[0].contact_work is not None else None,
+        **{name: sum(getattr(row, name) for row in rows) for name in works if getattr(rows[0], name) is not None},
         **{name: mean([getattr(row, name) for row in rows]) for name in LOADS},
     )
 

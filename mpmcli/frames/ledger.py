@@ -37,11 +37,12 @@ class LedgerRow:
         volume_error: volume of the cells inside liquids and grains over that of the particles in them, minus 1; 0 if
             hardly any cell is inside. collider_force, collider_torque: on each collider, N, and about its pivot, N m:
             means since the previous frame of the momentum that it took from the material (0 at frame 0); per metre of
-            depth in 2D. contact_force, contact_torque: for each pair of bodies of which one has a velocity field of its
-            own, see `ContactTable.pairs`, means of the force on the first by the second, N, and about the domain's
-            origin, N m. contact_overlap: deepest overlap of surfaces that met since the previous frame, in
-            cells; contact_work: work of contact on what it parts since the previous frame, J: negative while its
-            springs take up energy. These two are None if no body separates.
+            depth in 2D. collider_work: work of colliders with prescribed motion on the material since the previous
+            frame, J, summed over steps; None without such, or if not known. contact_force, contact_torque: for each
+            pair of bodies of which one has a velocity field of its own, see `ContactTable.pairs`, means of the force on
+            the first by the second, N, and about the domain's origin, N m. contact_overlap: deepest overlap of surfaces
+            that met since the previous frame, in cells; contact_work: work of contact on what it parts since the
+            previous frame, J: negative while its springs take up energy. These two are None if no body separates.
         rigid_pose: centre of each free collider, m, and its angle, rad, or its unit quaternion, the real part first;
             rigid_motion: its velocity, m/s, and its angular velocity, rad/s. Its energies are included in those above,
                 its momenta are not. emitted, retired: particles that have entered from emitters so far, and that have
@@ -73,6 +74,7 @@ class LedgerRow:
     collider_torque: tuple[tuple[float, ...], ...] = ()
     contact_force: tuple[tuple[float, ...], ...] = ()
     contact_torque: tuple[tuple[float, ...], ...] = ()
+    collider_work: float | None = None
     contact_work: float | None = None
     contact_overlap: float | None = None
     rigid_pose: tuple[tuple[float, ...], ...] = ()

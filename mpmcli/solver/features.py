@@ -50,7 +50,8 @@ class Features:
         d, on_cpu, total = kind.dimension, backend.on_cpu, kind.settings.solids == "total"
         self.friction, self.moving = RoughFaces(kind.rough, runs), MovingFaces(kind.moving, d, runs)
         self.period = grid.period
-        self.colliders = self.motion = self.rigid = self.rigid_contact = self.contact = self.points = None
+        # Their motion notes its work before the loads are reset.
+        self.motion = self.colliders = self.rigid = self.rigid_contact = self.contact = self.points = None
         if kind.colliders.count:
             how = {"on_cpu": on_cpu, "at_rest": total, "deterministic": grid.deterministic}
             self.colliders = Colliders(kind.colliders, d, grid.shape, PAD, runs, **how)
