@@ -15,7 +15,7 @@ from solver_state import scene_of
 
 from mpmcli.check.finding import Finding, FrameFindings
 from mpmcli.check.result_check import ResultCheck, check_kept
-from mpmcli.check.result_state import CrowdCheck, FrameCheck, MomentumCheck, RestCheck, StretchCheck
+from mpmcli.check.result_state import CrowdCheck, FrameCheck, MomentumCheck, RestCheck, StateCheck, StretchCheck
 from mpmcli.check.scene_check import check_scene
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
@@ -103,6 +103,32 @@ def test_rows_that_pile_up_are_told(places: Sequence[np.ndarray], law: str, per_
     if places[-1] is PILED and told:
         # Windows of five cells are as full as before.
         assert figures == {"densest_cell": pytest.approx(5.0), "empty_cells": pytest.approx(0.8, abs=0.02)}
+
+
+@pytest.mark.parametrize(
+    ("law", "share", "J", "fires"),
+    [
+        ("fluid", 0.02, 0.89, True),
+        ("fluid", 0.02, 0.91, False),
+        ("fluid", 0.005, 0.3, False),
+        ("viscoplastic", 0.02, 0.5, True),
+        # Spray; grains, which compact; a solid, which may be compressed on purpose.
+        ("fluid", 0.5, 2.0, False),
+        ("sand", 0.5, 0.5, False),
+        ("neo_hookean", 0.5, 0.5, False),
+    ],
+)
+def test_a_liquid_that_loses_its_volume_is_found(law: str, share: float, J: float, fires: bool) -> None:
+    """Once more than 1 % of its mass has had a J below 0.9 for longer than sound crosses it, sqrt(1.6) m / (10 m/s)."""
+    values = np.where(np.arange(len(POOL)) < share * len(POOL), J, 1.0)
+    _, found = seen(StateCheck, header_of(pool(), law), [POOL] * 4, volume_ratio=values)
+    assert [(one.rule, one.severity, one.body, one.value) for one in found] == [
+        ("compressed", "warning", "pool", J)
+    ] * fires
+    assert seen(StateCheck, header_of(pool(), law), [POOL] * 2, volume_ratio=values)[1] == []
+    if fires:
+        assert f"In frame 2 {100 * share:g} % of the mass" in found[0].what and "as since 0 s" in found[0].what
+        assert "its bulk modulus of 1e+05 Pa is too low" in found[0].what
 
 
 @pytest.mark.parametrize(("viscosity", "mean", "fires"), [(1.0, 1.25, True), (1.0, 1.15, False), (0.0, 1.25, False)])

@@ -16,6 +16,9 @@ from mpmcli.stability.limits import OVERLAP
 
 # No law is valid for J below the first. Coherent material would have torn for J above the second.
 CRUSHED, BLOWN_UP = 0.1, 10.0
+# J of liquids and pastes below which their modulus is too low for what presses on them, and the fraction of the mass of
+# a body that is reported.
+COMPRESSED, MUCH = 0.9, 0.01
 # Fraction of the particles of a frame on walls that is reported; bodies on the updated grid have none.
 HELD = 0.01
 # On a GPU the Courant number is estimated between measurements, during which an impact may double the speed.
@@ -67,7 +70,12 @@ class FrameCheck:
 
 
 class StateCheck(FrameCheck):
-    """Checks the values of each frame separately."""
+    """Checks the values of each frame."""
+
+    def __init__(self, header: RunHeader, findings: FrameFindings) -> None:
+        super().__init__(header, findings)
+        # Time since which each body that is compressed has been so, s.
+        self._since: dict[str, float] = {}
 
     def check(self, frame: Frame) -> bool:
         """Check a frame; return whether all of its values are finite."""
@@ -116,8 +124,10 @@ class StateCheck(FrameCheck):
 
     def _volumes(self, frame: Frame) -> None:
         J = volume_ratio(self._header, frame)
-        if J is None or len(J) == 0 or (J.min() >= CRUSHED and J.max() <= BLOWN_UP):
+        if J is None or len(J) == 0 or (J.min() >= COMPRESSED and J.max() <= BLOWN_UP):
+            self._since = {}
             return
+        self._compressed(frame.of_present)
         fine, coherent = np.isfinite(J), np.array([law.coherent for law in self._header.laws], bool)
         coheres = coherent[frame.material] if len(coherent) else False
         for severity, bad, word in (
@@ -131,6 +141,30 @@ class StateCheck(FrameCheck):
                 what = f"particle {{one}} {word}: its J is {J[p]:.4g}"
                 fix = "Make its material stiffer, the domain finer, or time.safety lower."
                 self._tell(severity, "volume", frame, p, what, fix, float(J[p]), word)
+
+    def _compressed(self, frame: Frame) -> None:
+        """Find liquids and pastes that lose volume under pressure for longer than a wave takes to cross them."""
+        header, J = self._header, volume_ratio(self._header, frame)
+        close = np.array([law.coherent and law.name in laws() and laws()[law.name].flows for law in header.laws], bool)
+        low = (J < COMPRESSED) & (close[frame.material] if len(close) else False)
+        since, self._since = self._since, {}
+        for label, body in enumerate(header.bodies if low.any() else ()):
+            own = frame.body == label
+            share = float(low[own].mean()) if own.any() else 0.0
+            if share <= MUCH:
+                continue
+            began = self._since[body.name] = since.get(body.name, frame.time)
+            modulus, smallest = body.material.get("bulk_modulus"), float(J[own].min())
+            known = bool(isinstance(modulus, float) and body.density and body.volume)
+            across = body.volume ** (1 / header.dimension) * (body.density / modulus) ** 0.5 if known else 0.0
+            if frame.time - began > across:
+                what = f"In frame {frame.index} {100 * share:.2g} % of the mass of "
+                what += (
+                    f'"{body.name}" has a J below {COMPRESSED:g}, the smallest {smallest:.3g}, as since {began:.4g} s: '
+                )
+                what += f"its bulk modulus{f' of {modulus:.4g} Pa' if known else ''} is too low for the pressure on it"
+                fix = "Set its bulk_modulus to ten times as much; if as much remains, refine the domain."
+                self._findings.add("warning", "compressed", frame.index, what, fix, smallest, body.name, body.name)
 
 
 def extent(position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
