@@ -141,6 +141,23 @@ def test_energy_from_nowhere_is_found(run, checked, share, severity):
     assert finding.value == pytest.approx(share * turned / grown, rel=1e-3)
 
 
+@pytest.mark.parametrize(("share", "lasts", "fires"), [(0.02, False, False), (0.05, False, True), (0.02, True, True)])
+def test_energy_that_is_gone_later_may_grow_by_more(run, checked, share, lasts, fires):
+    """The error of a step oscillates in a compression; of energy that stays a hundredth is found."""
+    energies, before = np.array([row.energy for row in run.rows]), run.rows[: K + 1]
+    turned = max(row.kinetic for row in before)
+    turned += sum(np.ptp([getattr(row, name) for row in before]) for name in ("potential", "elastic"))
+    rows = [
+        replace(row, elastic=row.elastic + energies[:K].min() + share * turned - row.energy)
+        if k == K or (lasts and k > K)
+        else row
+        for k, row in enumerate(run.rows)
+    ]
+    check = checked(rows=rows)
+    assert check.figures["energy_growth"] == pytest.approx(share, rel=0.15)
+    assert (rules(check), check.first_bad_frame) == (({"energy"}, K) if fires else (set(), None))
+
+
 def test_a_start_under_stress_is_named_as_a_cause(run):
     """Of energy that grows; a finding of another rule keeps its advice."""
     grown = run.with_row(K, elastic=1e6, courant_max=1.2)

@@ -131,7 +131,7 @@ def test_water_and_soft_jelly_make_no_energy(backend_of: Callable, name: str, re
     record_property("largest rise over the energy of the start", float(rise))
     assert max(energy.max() - 1, rise) < 0.02
     parts = (np.array([getattr(row, part) for row in rows]) for part in ("kinetic", "potential", "elastic"))
-    beyond, _ = energy_change(*parts, np.cumsum([row.contact_work for row in rows]))
+    beyond, *_ = energy_change(*parts, np.cumsum([row.contact_work for row in rows]))
     record_property("largest rise beyond the work of contact", float(beyond.max()))
     assert beyond.max() < ENERGY_SUSPECT
 
