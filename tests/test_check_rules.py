@@ -536,6 +536,25 @@ def test_a_rigid_body_that_liquid_cannot_lift_is_said(cells: float, fires: bool)
     assert found("no-liquid-between", [dry], colliders=[raft]) == []
 
 
+@pytest.mark.parametrize("kind", ["rigid body", "collider", "wall"])
+@pytest.mark.parametrize(("cells", "fires"), [(1.5, True), (3.9, True), (4.1, False)])
+def test_a_gap_that_liquid_hardly_passes_is_said(kind: str, cells: float, fires: bool) -> None:
+    """Of fewer than four cells, between a disc in a pool and a disc, a fixed post or a wall; once for each pair."""
+    radius, x = 6 * H, (0.5 if kind != "wall" else 1.0 - (6 + cells) * H)
+    discs = [{"name": "disc", "density": 2500.0, "shape": {"ball": {"center": [x, 0.3], "radius": radius}}}]
+    if kind != "wall":
+        second = {"ball": {"center": [x - 2 * radius - cells * H, 0.3], "radius": radius}}
+        discs.append({"name": "other", "shape": second} | ({"density": 2500.0} if kind == "rigid body" else {}))
+    pool = block("pool", [0.0, 0.0], [1.0, 0.5])
+    pool["shape"] = box([0.0, 0.0], [1.0, 0.5]) | {"subtract": [disc["shape"] for disc in discs]}
+    gaps = found("narrow-gap", [pool], colliders=discs)
+    assert [(one.severity, one.body) for one in gaps] == [("warning", "disc")] * fires
+    assert [one.value for one in gaps] == [pytest.approx(cells, abs=0.1)] * fires
+    # Without liquid, and with liquid that is elsewhere.
+    assert found("narrow-gap", [block("drop", [0.0, 0.7], [0.2, 0.9])], colliders=discs) == []
+    assert found("narrow-gap", [pool | {"material": SOLID}], colliders=discs) == []
+
+
 METAL = {"law": "von_mises", "density": 1000.0, "youngs_modulus": 1e6, "yield_stress": 1e4}
 LEFT, RIGHT, HEAP = box([0.1, 0.0], [0.3, 0.25]), box([0.6, 0.0], [0.8, 0.25]), box([0.2, 0.0], [0.8, 8 / 64])
 

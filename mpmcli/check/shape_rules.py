@@ -47,6 +47,8 @@ TIGHT, CRUSHED = 0.95, 0.25
 BEGINS_INSIDE = 0.1
 # Cells between a rigid body and the body below it from which on liquid enters the gap.
 UNDER = 1.0
+# Cells across a gap beside a rigid body below which liquid hardly flows through it.
+NARROW = 4.0
 # Stretch beside a grip over that of the body between two grips, as measured for a bar pulled to twice its length.
 UNEVEN = 1.11
 # Cells within which liquids and grains come to rest on colliders where they arrive, and that they stand off those that
@@ -305,7 +307,7 @@ def _rigid(facts: SceneFacts) -> Iterator[Finding]:
     scene, h = facts.scene, facts.scene.domain.spacing
     # A single elastic body has material on one side only.
     between = scene.emitters or len(facts.bodies) > 1 or any(not one.body.has_surface for one in facts.bodies)
-    shut = np.array(scene.domain.walls.faces(scene.dimension)) != OPEN
+    shut, told = np.array(scene.domain.walls.faces(scene.dimension)) != OPEN, set()
     for body in (collider for collider in scene.colliders if collider.free):
         lower, upper = np.array(body.form.bounds())
         cells = float((upper - lower).min() / h)
@@ -327,6 +329,9 @@ def _rigid(facts: SceneFacts) -> Iterator[Finding]:
             for one in scene.colliders
             if one is not body and not one.holds
         ]
+        liquids = [one.body.shape.form for one in facts.bodies if one.law.flows and one.law.coherent]
+        beside = np.min([form.signed_distance(points) for form in liquids], axis=0, initial=np.inf)
+        told.add(f'collider "{body.name}"')
         for name, distance in [("a wall", sides), *others]:
             depth = -float(distance.min(initial=np.inf)) / h
             if depth > BEGINS_INSIDE:
@@ -339,6 +344,17 @@ def _rigid(facts: SceneFacts) -> Iterator[Finding]:
                 )
                 fix = f"Set it {UNDER * h:.3g} m away if it should."
                 yield Finding("note", "no-liquid-between", what, fix, -depth, body.name)
+            elif depth > -NARROW * (1 - 1e-6) and name not in told:
+                gap = np.where(beside < h, distance if distance.ndim == 1 else distance.min(axis=1), np.inf).min()
+                if gap < NARROW * h * (1 - 1e-6):
+                    what = (
+                        f'The gap between rigid body "{body.name}" and {name} is {gap / h:.2g} cells wide: of liquid '
+                    )
+                    what += (
+                        f"that fills it, fewer than {NARROW:g} hardly let any through, and the body moves too slowly."
+                    )
+                    fix = f"Make it {NARROW * h:.3g} m wide, or domain.spacing {gap / NARROW:.3g} m."
+                    yield Finding("warning", "narrow-gap", what, fix, gap / h, body.name)
 
 
 def _standoff(facts: SceneFacts) -> Iterator[Finding]:
