@@ -25,6 +25,7 @@ from made_sweep import COUNT, MadeWorkers, made_workers, make_dataset, small_swe
 from test_plugin import LAW
 from tiny_sweep import BASE, contents, small_shards, tiny_sweep, told, write_sweep
 
+from mpmcli.check.finding import Finding
 from mpmcli.dataset import open as open_dataset
 from mpmcli.dataset import sweep_run
 from mpmcli.dataset.compute import Task, _with_step, compute
@@ -40,6 +41,7 @@ from mpmcli.materials.registry import parameter_models
 from mpmcli.output import open_result
 from mpmcli.output.lock import take_lock
 from mpmcli.scene.schema import Time
+from mpmcli.simulation import runner
 from mpmcli.simulation.runner import Recording, Runner
 
 # A law that is stable by its own word, and in truth is not: its pressure pulls.
@@ -392,6 +394,15 @@ def test_a_fault_in_one_trajectory_does_not_end_the_others(tmp_path: Path, monke
     assert (second.number, second.verdict, second.accepted) == (1, "failed", 0)
     assert second.reason == "ZeroDivisionError: division by zero (a fault of mpmcli)."
     assert first.verdict == third.verdict == "stable" and len(calls) == 3
+
+
+@pytest.mark.parametrize(("rules", "retries"), [(("turns",), 0), (("energy",), 2), (("compressed", "courant"), 2)])
+def test_a_retry_that_cannot_help_is_not_made(tmp_path, monkeypatch, rules, retries) -> None:
+    """A shorter step changes no water that turns, but energy that grows."""
+    found, check = tuple(Finding("warning", rule, f"{rule}.", "Change it.") for rule in rules), runner.check_kept
+    monkeypatch.setattr(runner, "check_kept", lambda *run: replace(check(*run), findings=found))
+    (row,) = compute(Task(tmp_path / "dataset", tiny_sweep(tmp_path, 1), (0,)))
+    assert (row.verdict, row.reason, row.retries, row.accepted) == ("suspect", f"{rules[0]}.", retries, 0)
 
 
 @pytest.mark.parametrize("count", [60, pytest.param(500, marks=pytest.mark.slow)])

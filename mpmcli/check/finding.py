@@ -13,6 +13,8 @@ Severity = Literal["error", "warning", "note"]
 Verdict = Literal["stable", "suspect", "unstable", "escaped", "failed"]
 # Rules on what the transfers take.
 LOSSES = ("dissipation", "impact-loss", "numerical-viscosity")
+# Rules on a run that a shorter step may change.
+OF_STEP = ("courant", "energy", "escaped", "ledger-not-finite", "not-finite", "overlap", "step-collapse", "volume")
 # In decreasing order of severity.
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 

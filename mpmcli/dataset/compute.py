@@ -117,7 +117,7 @@ class _Trial:
 
 
 def _compute(task: Task) -> list[Row]:
-    """Draw trajectories, run each until its verdict is accepted or no retries are left, and store them."""
+    """Draw trajectories, run each until its verdict is accepted or no retry can change it, and store them."""
     began = time.perf_counter()
     # A missing backend ends the sweep, not only a trajectory.
     _runner(task)
@@ -147,7 +147,7 @@ def _compute(task: Task) -> list[Row]:
             began = now
             if isinstance(outcome, Recording):
                 accepted = outcome.verdict in ("stable", task.sweep.accept)
-                if not accepted and retries < RETRIES:
+                if not accepted and outcome.of_step and retries < RETRIES:
                     continue
                 try:
                     trial.row = _stored(task, trial.row, trial.drawn, scenes[place], outcome, retries, accepted)

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from mpmcli.check.finding import Verdict
+from mpmcli.check.finding import OF_STEP, Verdict
 from mpmcli.check.result_check import check_kept
 from mpmcli.errors import MpmcliError
 from mpmcli.frames.frame import Frame
@@ -29,7 +29,8 @@ Observe = Callable[[Frame, LedgerRow], None]
 class Recording:
     """A run with T frames and rows, fewer if it stopped, its verdict, and the reason if that is not "stable".
 
-    `seconds`: wall time of its steps, without the first launch of a new batch, which compiles its kernels.
+    `seconds`: wall time of its steps, without the first launch of a new batch, which compiles its kernels. `of_step`:
+    whether a shorter step may change the verdict.
     """
 
     header: RunHeader
@@ -40,6 +41,7 @@ class Recording:
     verdict: Verdict
     reason: str
     seconds: float = 0.0
+    of_step: bool = True
 
 
 class Recorder:
@@ -65,17 +67,19 @@ class Recorder:
     def finished(self) -> Recording:
         """Return the recording of a run that has reached its end."""
         check = check_kept(self._header, None if self._observe else self._frames, self._ledger)
-        return self._recording(check.verdict, next((f.what for f in check.findings if f.severity != "note"), ""))
+        bad = [finding for finding in check.findings if finding.severity != "note"]
+        of_step = any(finding.rule in OF_STEP for finding in bad)
+        return self._recording(check.verdict, bad[0].what if bad else "", of_step=of_step)
 
     def stopped(self, error: UnstableRunError) -> Recording:
         """Return the recording of a run that became unstable."""
         escaped = error.diagnosis.cause.startswith((LEFT, OUTRAN))
         return self._recording("escaped" if escaped else "unstable", str(error))
 
-    def _recording(self, verdict: Verdict, reason: str) -> Recording:
+    def _recording(self, verdict: Verdict, reason: str, *, of_step: bool = True) -> Recording:
         counts = self._run.step_count, self._run.particle_count
         seconds = self._run.batch.seconds - self._run.batch.first_seconds - self._began
-        return Recording(self._header, self._frames, self._ledger, *counts, verdict, reason, seconds)
+        return Recording(self._header, self._frames, self._ledger, *counts, verdict, reason, seconds, of_step)
 
 
 # Largest number of kinds with kept kernels, and largest number of particles of a scene that uses kept kernels.
