@@ -142,6 +142,32 @@ PHASE = np.linspace(0, 4 * np.pi, 21)
 TURNS = np.minimum(PHASE, 2.0)
 
 
+@pytest.mark.parametrize("by", ["sand", "raft"])
+@pytest.mark.parametrize(("cells", "fires"), [(0.5, True), (2.0, False)])
+def test_water_that_something_else_drives_does_not_turn(by: str, cells: float, fires: bool) -> None:
+    """Sand that has slid into it, or a rigid body, by more than a cell."""
+    bodies = [
+        {"name": "water", "material": WATER, "shape": box([0.0, 0.0], [2.0, 0.8])},
+        {"name": "sand", "material": {"preset": "sand"}, "shape": box([0.0, 0.8], [2.0, 1.0])},
+    ]
+    domain = {"size": [2.0, 1.6], "spacing": H, "walls": "separate", "gravity": [0.0, -9.81]}
+    scene = scene_of(domain=domain, time={"end": 1.0, "frames": 20}, bodies=bodies)
+    backend = {"arch": "cpu", "threads": 1, "precision": "f64"}
+    header = RunHeader.of(scene, scene_to_toml(scene), [laws()["fluid"], laws()["sand"]], backend)
+    x = np.concatenate([sample.position for sample in sample_bodies(scene)])
+    label, findings = (x[:, 1] > 0.8).astype(np.int32), FrameFindings()
+    check = RestCheck(header, findings, 20)
+    for k in range(21):
+        # Water moves three cells in the last half; what drives it has moved before.
+        moved = np.where(label == 0, 3.0 * max(k - 10, 0) / 10, cells * (k > 0) * (by == "sand"))
+        place = x + H * moved[:, None] * [1.0, 0.0]
+        pose = ((0.5 + cells * H * (k > 0), 0.9, 0.0),) if by == "raft" else ()
+        energies = {"kinetic": TURNS[k], "potential": 6000.0 - 0.02 * PHASE[k], "elastic": 0.0}
+        row = made_row(k, 2, mass=1600.0, rigid_pose=pose, **energies)
+        check.check(Frame(k, 0.05 * k, 10 * k, place, 0 * place, label, label), row)
+    assert [one.rule for one in findings.found()] == ["turns"] * fires
+
+
 @pytest.mark.parametrize(
     ("kinetic", "released", "cells", "law", "more", "fires"),
     [

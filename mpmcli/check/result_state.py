@@ -281,7 +281,7 @@ class RestCheck(FrameCheck):
     def __init__(self, header: RunHeader, findings: FrameFindings, last: int) -> None:
         super().__init__(header, findings)
         self._rows: list[LedgerRow] = []
-        self._last, self._middle = last, np.zeros((0, header.dimension))
+        self._last, self._start, self._middle = last, *np.zeros((2, 0, header.dimension))
         known = header.spacing is not None and header.gravity is not None
         self._closed = known and not (header.driven or header.particle_count_varies or header.moved)
         self._liquid = np.array([law.name == "fluid" for law in header.laws], bool)
@@ -292,12 +292,21 @@ class RestCheck(FrameCheck):
         if not (self._closed and self._liquid.any()):
             return
         self._rows.append(row)
+        if len(self._rows) == 1:
+            self._start = frame.position
         if frame.index == self._last // 2:
             self._middle = frame.position
         water = self._liquid[frame.material] & self._thin[frame.body]
         if frame.index < self._last or len(self._middle) == 0 or not water.any() or not self._turns():
             return
         header = self._header
+        # Other bodies that have moved may have driven it.
+        moved = nearest_image(frame.position[~water] - self._start[~water], header.period)
+        if row.rigid_pose:
+            poses = np.array([self._rows[0].rigid_pose, row.rigid_pose])[..., : header.dimension]
+            moved = np.concatenate([moved, poses[1] - poses[0]])
+        if np.linalg.norm(moved, axis=1).max(initial=0.0) > TURNED * header.spacing:
+            return
         apart = nearest_image(frame.position[water] - self._middle[water], header.period)
         cells = float(np.linalg.norm(apart, axis=1).mean()) / header.spacing
         if cells > TURNED:
