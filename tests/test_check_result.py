@@ -142,7 +142,7 @@ def test_energy_from_nowhere_is_found(run, checked, share, severity):
 
 
 @pytest.mark.parametrize(("share", "lasts", "fires"), [(0.02, False, False), (0.05, False, True), (0.02, True, True)])
-def test_energy_that_is_gone_later_may_grow_by_more(run, checked, share, lasts, fires):
+def test_energy_that_is_gone_at_once_may_grow_by_more(run, checked, share, lasts, fires):
     """The error of a step oscillates in a compression; of energy that stays a hundredth is found."""
     energies, before = np.array([row.energy for row in run.rows]), run.rows[: K + 1]
     turned = max(row.kinetic for row in before)

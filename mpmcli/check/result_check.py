@@ -57,9 +57,9 @@ TOLD = {
 # whose bodies share one velocity field stay below 2e-4, bodies thrown at a wall at up to five times their speed of
 # sound below 1e-3. Where hardly anything moves, it is relative to a share of the energy stored, AT_REST.
 ENERGY_SUSPECT, ENERGY_WRONG = 1e-2, 1e-1
-# Growth that is allowed in addition if it is gone later: the error of a step in a strong compression, and energy that
-# shifts of particles store until viscosity takes it.
-PASSING = 3e-2
+# Growth that is allowed in addition if half of it is gone within a BRIEF part of the frames, or in the next one: the
+# error of a step in a strong compression, and energy that shifts of particles store until viscosity takes it.
+PASSING, BRIEF = 3e-2, 50
 # Growth that is allowed in addition after a minimum at which contact holds energy, which is not in the sum. A block of
 # jelly of 10 cells that rests on a floor has up to 0.045.
 HELD = 6e-2
@@ -294,8 +294,8 @@ def check_ledger(entries: Sequence[Entry], header: RunHeader, findings: FrameFin
         if header.moved:
             what = "By frame {number} the energy has grown by {value:.3g} of the energy turned over beyond the work of "
             what += "colliders"
-        bad = np.maximum(lasting, growth - PASSING) > ENERGY_SUSPECT
-        tell("energy", growth, bad, growth > ENERGY_WRONG, what, HALVE_STEP)
+        allowed = ENERGY_SUSPECT + PASSING * (lasting < growth / 2)
+        tell("energy", growth, growth > allowed, growth > ENERGY_WRONG, what, HALVE_STEP)
     courant, forced = of["courant_max"], any(row.limit == "forced" for row in rows)
     what = f"Before frame {{number}} a node moved {{value:.3g}} cells in a step, {NODE_COURANT:g} is safe"
     fix = 'Set time.step = "auto".' if forced else LOWER_SAFETY
@@ -357,7 +357,7 @@ def energy_change(
 ) -> tuple[np.ndarray, float, np.ndarray]:
     """Return growth above the minimum so far, (T,), final loss, and growth that lasts, over the energy turned over.
 
-    What lasts, (T,), is that of the smallest energy from then on.
+    What lasts, (T,), is that of the smallest energy from then on in a BRIEF part of the frames.
     That is at least the share AT_REST of the energy stored; potential energy is that above the lowest place. The energy
     that `work` has brought so far is not counted.
     """
@@ -367,7 +367,9 @@ def energy_change(
     turned += highest(np.abs(work) + 0.0 * kinetic)
     stored = highest(kinetic + np.abs(potential) + np.abs(elastic))
     turned = np.maximum(np.maximum(turned, AT_REST * stored), np.finfo(np.float64).tiny)
-    before, after = lowest(total), lowest(total[::-1])[::-1]
+    before, after = lowest(total), total.copy()
+    for k in range(1, min(max(1, len(total) // BRIEF), len(total) - 1) + 1):
+        after[:-k] = np.minimum(after[:-k], total[k:])
     return (total - before) / turned, float((total[0] - total[-1]) / turned[-1]), (after - before) / turned
 
 
