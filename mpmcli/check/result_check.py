@@ -59,7 +59,7 @@ TOLD = {
 ENERGY_SUSPECT, ENERGY_WRONG = 1e-2, 1e-1
 # Growth that is allowed in addition if half of it is gone within a BRIEF part of the frames, or in the next one: the
 # error of a step in a strong compression, and energy that shifts of particles store until viscosity takes it.
-PASSING, BRIEF = 3e-2, 50
+PASSING, BRIEF = 3e-2, 20
 # Growth that is allowed in addition after a minimum at which contact holds energy, which is not in the sum. A block of
 # jelly of 10 cells that rests on a floor has up to 0.045.
 HELD = 6e-2
