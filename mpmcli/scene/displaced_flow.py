@@ -38,7 +38,9 @@ class DisplacedFlow:
 
     def pressure(self, density: float, shear_stress: float) -> float:
         """Return the pressure, Pa, that pushes material of this shear stress, Pa, at `rate`, and makes its jet."""
-        return self.strain * shear_stress + JET * density * max(self.speed**2 - self.fastest**2, 0.0)
+        return self.strain * shear_stress + JET * density * max(
+            (self.speed - self.fastest) * (self.speed + self.fastest), 0.0
+        )
 
 
 def displaced_flow(scene: Scene) -> DisplacedFlow:
@@ -52,8 +54,11 @@ def displaced_flow(scene: Scene) -> DisplacedFlow:
     pushing = [one for one in scene.colliders if one.driven and not one.holds]
     if not (pushing and scene.bodies):
         return DisplacedFlow()
-    lattice, end = _Lattice(scene), scene.time.end
+    end = scene.time.end
     fastest = max(one.fastest(scene.domain, end) for one in pushing)
+    if not fastest > 0:
+        return DisplacedFlow()
+    lattice = _Lattice(scene)
     flows = [_flow_at(lattice, pushing, time, fastest) for time in np.linspace(0, end * (1 - MOMENT), INSTANTS)]
     speed, strain, rate = (max(getattr(flow, key) for flow in flows) for key in ("speed", "strain", "rate"))
     return DisplacedFlow(fastest, speed, strain if speed > 1.05 * fastest else min(strain, AROUND), rate)
@@ -118,7 +123,9 @@ def _flow_at(lattice: _Lattice, pushing: list[Collider], time: float, fastest: f
         inside = one.signed_distance(points, time) <= 0
         velocity[inside] = _velocity(one, points[inside], time, MOMENT * end)
         free &= ~inside
-    velocity /= max(float(np.linalg.norm(velocity, axis=1).max()), 1e-9 * fastest)
+    # The square of a speed may overflow; nothing is pushed then.
+    with np.errstate(over="ignore"):
+        velocity /= max(float(np.linalg.norm(velocity, axis=1).max()), 1e-9 * fastest)
     # Velocities of faces, each at its lower cell; they are those of the fastest point here.
     inflow, faces = np.zeros(n), np.zeros((d, n))
     for a, (lower, upper) in enumerate(pairs):
