@@ -59,7 +59,9 @@ def displaced_flow(scene: Scene) -> DisplacedFlow:
     if not fastest > 0:
         return DisplacedFlow()
     lattice = _Lattice(scene)
-    flows = [_flow_at(lattice, pushing, time, fastest) for time in np.linspace(0, end * (1 - MOMENT), INSTANTS)]
+    # Squares of lengths and speeds may overflow; nothing is pushed then.
+    with np.errstate(over="ignore", invalid="ignore"):
+        flows = [_flow_at(lattice, pushing, time, fastest) for time in np.linspace(0, end * (1 - MOMENT), INSTANTS)]
     speed, strain, rate = (max(getattr(flow, key) for flow in flows) for key in ("speed", "strain", "rate"))
     return DisplacedFlow(fastest, speed, strain if speed > 1.05 * fastest else min(strain, AROUND), rate)
 
@@ -123,9 +125,7 @@ def _flow_at(lattice: _Lattice, pushing: list[Collider], time: float, fastest: f
         inside = one.signed_distance(points, time) <= 0
         velocity[inside] = _velocity(one, points[inside], time, MOMENT * end)
         free &= ~inside
-    # The square of a speed may overflow; nothing is pushed then.
-    with np.errstate(over="ignore"):
-        velocity /= max(float(np.linalg.norm(velocity, axis=1).max()), 1e-9 * fastest)
+    velocity /= max(float(np.linalg.norm(velocity, axis=1).max()), 1e-9 * fastest)
     # Velocities of faces, each at its lower cell; they are those of the fastest point here.
     inflow, faces = np.zeros(n), np.zeros((d, n))
     for a, (lower, upper) in enumerate(pairs):

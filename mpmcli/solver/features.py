@@ -71,7 +71,8 @@ class Features:
             self.points = ColliderPoints(self.colliders, grid.node_count, grid.layers, runs, **how)
         self.repulsion = ParticleContact(grid, groups[0], runs) if total and max(kind.bodies) > 1 else None
         self.emission = Emission(kind.inflow, d, runs) if kind.inflow.groups else None
-        solids = [e for e, g in enumerate(kind.inflow.groups) if kind.members[g].coherent]
+        laws = [kind.members[g] for g in kind.inflow.groups]
+        solids = [e for e, law in enumerate(laws) if law.coherent and law.deformation == "F"]
         self.nozzles = Nozzles(self.emission, solids) if solids else None
         for g, group in enumerate(groups if self.emission else ()):
             group.pour_from(self.emission, tuple(e for e, own in self.emission.members if own == g))
