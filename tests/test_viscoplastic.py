@@ -253,9 +253,12 @@ def test_parameters() -> None:
     assert chosen.shear_modulus == pytest.approx(1.962e6 / 4)
     assert len(notes) == 2
     assert "4.905e+05 Pa" in notes[1]
-    firm, notes = mud.model_copy(update={"yield_stress": 1e5}).resolve(bounds)
-    assert firm.shear_modulus == pytest.approx(2e6)
-    assert "5 %" in notes[1]
+    # A punch meets 2 + pi of the yield stress (Prandtl).
+    firm, _ = mud.model_copy(update={"yield_stress": 1e5}).resolve(bounds)
+    assert firm.bulk_modulus == pytest.approx((2 + np.pi) * 1e5 / 0.01)
+    given, notes = mud.model_copy(update={"yield_stress": 1e5, "bulk_modulus": 1.962e6}).resolve(bounds)
+    assert given.shear_modulus == pytest.approx(2e6)
+    assert "5 %" in notes[-1]
     assert parameters().resolve(bounds) == (parameters(), [])
     for wrong in ({"consistency": 0.0}, {"yield_stress": -1.0}, {"flow_index": 0.05}, {"flow_index": 2.5}):
         with pytest.raises(ValidationError):
