@@ -27,8 +27,8 @@ class Phase:
     Attributes:
         name: name of the phase and of its body.
         over: the items of the loop: nodes in use ("nodes"), nodes on the planes of faces ("planes"), rows of nodes
-            ("rows"), the particles of a group ("particles"), rows of nodes per collider ("loads"), or
-            runs ("runs").
+            ("rows"), the particles of a group ("particles"), rows of nodes per collider ("loads"), or runs
+            ("runs").
         stage: its place in the step; phases of a stage keep the order in which they are listed.
         group: index of the group of particles.
         adds: whether particles add to nodes; without atomics this is done colour by colour of pencils.

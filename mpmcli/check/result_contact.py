@@ -82,8 +82,11 @@ class _Body:
 
 @dataclass
 class _Slide:
-    """Sums over the time in which a body touches an obstacle: the way that it slid, and that of its centre, the work of
-    friction over its coefficient, and the work, and the changes of spin."""
+    """Sums over the time in which a body touches an obstacle.
+
+    `way`, m, is how far it slid, `moved` how far its centre went; `rubbed` is the work of friction, and `pressed` that
+    of a coefficient of 1, J; `expected` and `found` are changes of spin, up to `frame`.
+    """
 
     body: _Body
     way: np.ndarray | float = 0.0

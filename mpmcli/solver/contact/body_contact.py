@@ -104,7 +104,7 @@ class BodyContact(Feature):
         return self.loads.capacity * self.loads.width + 1
 
     def read(self, run: int) -> np.ndarray:
-        # Entry by entry Vulkan would lose what the next kernel reads.
+        # The whole field: with an entry written from Python, the next kernel on Vulkan reads wrong values.
         deepest = self.deepest.to_numpy()
         found = np.append(self.loads.read(run), deepest[run])
         deepest[run] = 0.0
