@@ -98,7 +98,7 @@ def _turns(facts: SceneFacts) -> Iterator[Finding]:
             yield Finding("note", "units", what, fix, angle, one.name)
 
 
-def _spins(one: Collider, rate: float, end: float) -> bool:
+def _spins(one: Collider, rate: float, _end: float) -> bool:
     """Return whether a rigid body turns by itself, faster than it would roll."""
     return rate * one.radius > 2 * float(np.linalg.norm(one.velocity))
 
