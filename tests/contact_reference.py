@@ -178,7 +178,7 @@ def impulse(
     kappa = stiffness * area * dt**2 / reduced
     far = [sign * way @ n for sign, way in zip((1, -1), ways, strict=False)]
     if both:
-        kappa = min(kappa, 1.0)
+        kappa = min(kappa, 0.5)
         far = [far[k] if pushes[k] > 0 else -overlap - far[1 - k] for k in range(2)]
     away = u @ n
     push = max(0.0, overlap / dt - away / 2) * kappa / (1 + kappa / 2)

@@ -27,7 +27,7 @@ from mpmcli.solver.transfer.splines import PAD
 # Fraction of the velocity after a step with which springs act in it: the least with which they make no energy.
 IMPLICIT = 0.5
 # Largest k dt^2 / m of the springs between two bodies at a node, of which one may have hardly any mass there.
-STIFFEST = 1.0
+STIFFEST = 0.5
 # Range of overlaps, cells, over which approach is increasingly stopped, independent of the springs.
 STOPS = (0.1, 0.2)
 # Entries of `LedgerRow`: `BodyContact.deepest`, and one of `BodyContact.loads`.
