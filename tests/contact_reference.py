@@ -175,10 +175,10 @@ def impulse(
     if area == 0.0 or not force.any():
         return np.zeros(len(node)), seen[0]
     n, overlap = unit(force), np.linalg.norm(force) / area
-    kappa = stiffness * area * dt**2 / reduced
+    least = 0.15 * min(surface.density for surface in surfaces) * h * area if both else 0.0
+    kappa = stiffness * area * dt**2 / max(reduced, least)
     far = [sign * way @ n for sign, way in zip((1, -1), ways, strict=False)]
     if both:
-        kappa = min(kappa, 0.5)
         far = [far[k] if pushes[k] > 0 else -overlap - far[1 - k] for k in range(2)]
     away = u @ n
     push = max(0.0, overlap / dt - away / 2) * kappa / (1 + kappa / 2)

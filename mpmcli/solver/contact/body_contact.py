@@ -26,8 +26,9 @@ from mpmcli.solver.transfer.splines import PAD
 
 # Fraction of the velocity after a step with which springs act in it: the least with which they make no energy.
 IMPLICIT = 0.5
-# Largest k dt^2 / m of the springs between two bodies at a node, of which one may have hardly any mass there.
-STIFFEST = 0.5
+# Least mass of a node for the springs between two bodies, over that of a layer of a cell below its points: one of both
+# may have hardly any mass there.
+LIGHT = 0.15
 # Range of overlaps, cells, over which approach is increasingly stopped, independent of the springs.
 STOPS = (0.1, 0.2)
 # Entries of `LedgerRow`: `BodyContact.deepest`, and one of `BodyContact.loads`.
@@ -185,18 +186,20 @@ class BodyContact(Feature):
                 J[b] = -reduced * u[b]
         elif (bodies and a >= ti.static(int(self.surfaces.shares))) or way < REACH * h:
             gap, n, aside, area, deepest = self.springs(at, a, c)
-            kappa, implicit = 2.0 / soft * at.step.dt**2 / h * area / reduced, IMPLICIT
+            mass, implicit = reduced, IMPLICIT
             if bodies:
-                kappa = ti.min(kappa, STIFFEST)
+                density = ti.min(self.rows[row + a, DENSITY], self.rows[row + c, DENSITY])
+                mass = ti.max(reduced, LIGHT * density * h * area)
             elif area < 0.0 and way <= 0.0:
                 # Material without a surface, because it was torn or crushed, is stopped behind an obstacle.
-                gap, kappa = -h, 0.0
+                gap = -h
                 for b in ti.static(range(d)):
                     n[b] = -facing[b]
             elif ti.static(self.couples):
                 # What arrives at an overlap of up to a step leaves no faster than it came.
                 swing = at.swing(c - self.layers, 2.0 / soft * at.step.dt**2)
                 implicit = ti.max(implicit, 1.0 - 2.0 / ti.max(swing, SMALLEST))
+            kappa = 2.0 / soft * at.step.dt**2 / h * ti.max(area, 0.0) / mass
             if gap < 0.0:
                 pushed, yields, holds = self.impulse(
                     gap / h, u, n, aside, kappa, implicit, reduced, h / at.step.dt, friction
