@@ -271,7 +271,7 @@ def test_short_steps_move_no_node_far(backend_of: Callable) -> None:
     The lowest particles of one end 1e-6 cells below a row of nodes, which have hardly any of its mass. With a push that
     falls with the step, not with its square, these would move as far in any step, and no step would be short enough.
     """
-    tables = {"time": {"end": 1e-6, "frames": 1, "step": 1e-7}, "domain": {"walls": "separate"}}
+    tables = {"time": {"end": 1e-6, "frames": 1, "step": 1e-7}, "domain": {"walls": "separate"} | NONE}
     both = scene([body("a", [6, 0], [12, 2.5]), body("b", [8, 2.5], [10, 4.5])], **tables)
     run = build_run(both, backend_of("f64", 1))
     group = run.groups[0]
