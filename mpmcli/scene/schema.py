@@ -189,7 +189,7 @@ class SolverSettings(Table):
     deterministic: Flag = Field(
         False,
         description="Whether a GPU adds in fixed point, so that two runs have the same bytes. On the CPU they have "
-        "them in any case, and nothing changes but contact.default.",
+        "them in any case.",
     )
 
 
