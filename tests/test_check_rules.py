@@ -580,12 +580,27 @@ LEFT, RIGHT, HEAP = box([0.1, 0.0], [0.3, 0.25]), box([0.6, 0.0], [0.8, 0.25]), 
             {"bodies": [{"name": n, "material": METAL, "shape": s} for n, s in (("a", LEFT), ("b", RIGHT))]},
             {"bodies": [{"name": n, "material": SOLID, "shape": s} for n, s in (("a", LEFT), ("b", RIGHT))]},
         ),
+        (
+            "submerged",
+            {
+                "bodies": [
+                    {"name": "a", "material": GRAINS, "shape": LEFT},
+                    {"name": "b", "material": FLUID, "shape": RIGHT},
+                ]
+            },
+            {
+                "bodies": [
+                    {"name": "a", "material": GRAINS, "shape": LEFT},
+                    {"name": "b", "material": SOLID, "shape": RIGHT},
+                ]
+            },
+        ),
     ],
 )
 def test_numbers_in_other_units_or_of_another_kind(rule: str, said: dict, other: dict) -> None:
     """What newcomers write in cm, in degrees for a coefficient, in radians for degrees; the rest is left alone."""
     (finding,) = found(rule, **said)
-    assert finding.severity == ("note" if rule in ("low-heap", "large-domain", "welds") else "warning")
+    assert finding.severity == ("note" if rule in ("low-heap", "large-domain", "welds", "submerged") else "warning")
     assert found(rule, **other) == []
 
 

@@ -1,4 +1,4 @@
-"""Rules on materials: impact speed, softness, locking, density ratio, friction angle, rest on the floor."""
+"""Rules on materials: impact speed, softness, locking, density ratio, friction, rest on the floor, sand in liquids."""
 
 import math
 from collections.abc import Iterator
@@ -42,6 +42,7 @@ def material_findings(facts: SceneFacts) -> Iterator[Finding]:
     yield from _slippery(facts)
     yield from _pulling(facts)
     yield from _unpressed(facts)
+    yield from _submerged(facts)
 
 
 def _impact(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
@@ -169,6 +170,20 @@ def _unpressed(facts: SceneFacts) -> Iterator[Finding]:
             )
             fix = 'Set initial_pressure = "hydrostatic" to begin at rest.'
             yield Finding("note", "no-pressure", what, fix, pressure, body.name)
+
+
+def _submerged(facts: SceneFacts) -> Iterator[Finding]:
+    """Yield sand beside liquids, which do not enter its pores: the friction of sand is that of the total pressure."""
+    sources = facts.scene.sources
+    sand = [source.name for source in sources if hasattr(source.material, "friction_angle")]
+    liquids = [source.name for source in sources if source.material.hydrostatic]
+    if sand and liquids:
+        what = (
+            f"The pressure of {several(quoted(liquids))} on {several(quoted(sand))} counts for its friction, because "
+        )
+        what += "no liquid enters its pores: where it is submerged it holds slopes of any angle."
+        fix = "To let it slide, leave the liquid out, and lower the density of the sand by that of the liquid."
+        yield Finding("note", "submerged", what, fix, len(sand), sand[0])
 
 
 def _floor(facts: SceneFacts) -> tuple[int, int | None]:
