@@ -559,6 +559,17 @@ METAL = {"law": "von_mises", "density": 1000.0, "youngs_modulus": 1e6, "yield_st
 LEFT, RIGHT, HEAP = box([0.1, 0.0], [0.3, 0.25]), box([0.6, 0.0], [0.8, 0.25]), box([0.2, 0.0], [0.8, 8 / 64])
 
 
+def stacked(upper: float, lower: float, **more: object) -> dict:
+    """Return two liquids of these densities, one on the other."""
+    halves = (("lower", lower, box([0.0, 0.0], [1.0, 0.5])), ("upper", upper, box([0.0, 0.5], [1.0, 1.0])))
+    return {
+        "bodies": [
+            {"name": name, "material": FLUID | {"density": density}, "shape": shape} | more
+            for name, density, shape in halves
+        ]
+    }
+
+
 @pytest.mark.parametrize(
     ("rule", "said", "other"),
     [
@@ -595,12 +606,15 @@ LEFT, RIGHT, HEAP = box([0.1, 0.0], [0.3, 0.25]), box([0.6, 0.0], [0.8, 0.25]), 
                 ]
             },
         ),
+        ("overturning", stacked(1200.0, 800.0), stacked(800.0, 1200.0)),
+        ("overturning", stacked(1200.0, 800.0), stacked(1200.0, 800.0, sampling="turned")),
     ],
 )
 def test_numbers_in_other_units_or_of_another_kind(rule: str, said: dict, other: dict) -> None:
     """What newcomers write in cm, in degrees for a coefficient, in radians for degrees; the rest is left alone."""
     (finding,) = found(rule, **said)
-    assert finding.severity == ("note" if rule in ("low-heap", "large-domain", "welds", "submerged") else "warning")
+    notes = ("low-heap", "large-domain", "welds", "submerged", "overturning")
+    assert finding.severity == ("note" if rule in notes else "warning")
     assert found(rule, **other) == []
 
 

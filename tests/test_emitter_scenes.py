@@ -78,7 +78,8 @@ def test_the_mouth_is_the_section_and_the_flow_its_area_times_the_speed(shape, v
         elif sampling == "turned":
             assert (ahead > 0).all() and (ahead < thickness).all()
             assert emitter.shape.form.contains(places + (sheets.lead - ahead)[:, None] * mouth.direction).all()
-        assert len(places) == sheets.particles and sheets.count == math.ceil(1.0 / sheets.period - 1e-9)
+        assert len(places) == sheets.particles
+        assert sheets.count == math.ceil((1.0 + sheets.early) / sheets.period - 1e-9)
         # Each particle fills about as much as one of a body.
         assert sheets.volume == pytest.approx(scene.domain.spacing**scene.dimension / 2**scene.dimension, rel=0.15)
 
@@ -224,7 +225,7 @@ def test_sheets_of_a_rate_that_varies(dimension: int, name: str) -> None:
     # In a nozzle before the mouth, which pulses have not.
     assert (sheets.lead > 0) == (name == "number")
     assert entered == pytest.approx(volume(sheets.due[1:] + sheets.early), abs=own / 100)
-    assert sheets.particles * sheets.volume == pytest.approx(volume(1.0), abs=own)
+    assert sheets.particles * sheets.volume == pytest.approx(volume(1.0 + sheets.early), abs=own)
     middle = np.interp(own * (np.arange(sheets.count) + 0.5), volume(TIMES), TIMES)
     expected = np.gradient(volume(TIMES), TIMES) / sheets.mouth.area
     assert sheets.speeds[:-1] == pytest.approx(np.interp(middle, TIMES, expected)[:-1], rel=0.02, abs=1e-3)

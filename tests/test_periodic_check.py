@@ -55,6 +55,24 @@ def test_nothing_falls_onto_a_periodic_face() -> None:
     assert scene_bounds(two_balls(wall_velocity={"y_max": [7.0, 0.0]})).speed == 7.0
 
 
+@pytest.mark.parametrize(
+    ("material", "speed"),
+    [
+        ({"law": "fluid", "viscosity": 50.0}, 1000.0 * 3.0 * 0.5**2 / 50.0),
+        ({"law": "viscoplastic", "yield_stress": 2000.0, "consistency": 1.0}, 0.0),
+        ({"law": "fluid"}, 60.0),
+    ],
+)
+def test_a_layer_that_sticks_is_no_faster_than_its_weight_shears_it(material: dict, speed: float) -> None:
+    """rho g H^2 / mu at most, to the spacing of the rates; a paste below its yield stress rests; else gravity t."""
+    shape = {"box": {"min": [0.0, 0.0], "max": [2.0, 0.5]}}
+    film = {"name": "film", "material": material | {"density": 1000.0}, "shape": shape}
+    walls = {"x_min": "periodic", "x_max": "periodic", "y_min": "stick"}
+    domain = {"size": [2.0, 1.0], "spacing": 0.05, "gravity": [3.0, 0.0], "walls": walls}
+    found = scene_bounds(scene_of(domain=domain, time={"end": 20.0, "frames": 1}, bodies=[film])).speed
+    assert speed <= found <= 1.3 * speed
+
+
 def test_the_cells_across_the_face_are_neighbours() -> None:
     """A layer that fills the lower half from face to face is inside up to both, where walls would say the same.
 

@@ -127,6 +127,28 @@ def test_water_that_is_poured_thins_as_fast_as_it_falls(
     assert np.mean(found, axis=0) == pytest.approx(0.048 * 0.4, rel=0.05)
 
 
+def test_a_wide_and_slow_stream_is_drawn_together(backend: Backend) -> None:
+    """16 cells wide at 0.2 m/s: width times speed is that at the mouth at three heights, to 10 %.
+
+    With the modulus that its fall requires, a quarter of that by which suction draws it together, it is a spray five
+    times as wide. What has passed the mouth is the rate times the time, and the nozzle is full at the end.
+    """
+    water = WATER | {"bulk_modulus": "auto"}
+    mouth = {"box": {"min": [0.012, 0.188], "max": [0.108, 0.212]}}
+    tap = {"name": "tap", "material": water, "shape": mouth, "velocity": [0.0, -0.2]}
+    drop = {"box": {"min": [0.0, 0.0], "max": [0.012, 0.012]}}
+    found = []
+    # The nozzle is filled in the first step.
+    for frame, row in list(build_run(poured(water, drop, emitters=[tap]), backend).frames())[1:]:
+        stream = (frame.fields["status"] == 1) & (frame.body == 1)
+        x, v = frame.position[stream].astype(float), frame.velocity[stream].astype(float)
+        assert row.emitted_mass == pytest.approx(1000.0 * 0.096 * 0.2 * frame.time, abs=1000.0 * 0.096 * SPACING / 8)
+        assert row.nozzle_mass == pytest.approx(1000.0 * 0.096 * 2 * SPACING, rel=0.1)
+        if frame.time > 0.24:
+            found.append(flows(x, v, [0.16, 0.14, 0.12]))
+    assert np.mean(found, axis=0) == pytest.approx(0.096 * 0.2, rel=0.15)
+
+
 @pytest.mark.slow
 def test_water_poured_into_a_glass(backend: Backend, record_property: Callable) -> None:
     """Width times speed is that at the mouth, 40 mm at 0.5 m/s, to 10 %; its depth that of what was poured, to 2 %."""

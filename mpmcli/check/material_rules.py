@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator
+from itertools import permutations
 
 import numpy as np
 
@@ -43,6 +44,7 @@ def material_findings(facts: SceneFacts) -> Iterator[Finding]:
     yield from _pulling(facts)
     yield from _unpressed(facts)
     yield from _submerged(facts)
+    yield from _overturning(facts)
 
 
 def _impact(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
@@ -184,6 +186,23 @@ def _submerged(facts: SceneFacts) -> Iterator[Finding]:
         what += "no liquid enters its pores: where it is submerged it holds slopes of any angle."
         fix = "To let it slide, leave the liquid out, and lower the density of the sand by that of the liquid."
         yield Finding("note", "submerged", what, fix, len(sand), sand[0])
+
+
+def _overturning(facts: SceneFacts) -> Iterator[Finding]:
+    """Yield liquids on a lattice of which a heavier one lies on a lighter one: its rows resist the first motion."""
+    (axis, side), h = _floor(facts), facts.scene.domain.spacing
+    liquids = [one.body for one in facts.bodies if one.body.material.hydrostatic] if side is not None else []
+    for heavy, light in permutations(liquids, 2):
+        over, under = heavy.shape.form.bounds(), light.shape.form.bounds()
+        # Positive where the lowest point of one is above the highest of the other.
+        gap = over[0][axis] - under[1][axis] if side == 0 else under[0][axis] - over[1][axis]
+        across = np.arange(facts.scene.dimension) != axis
+        beside = (np.minimum(over[1], under[1]) - np.maximum(over[0], under[0]))[across] > 0
+        lattices = [one.name for one in (heavy, light) if one.sampling == "lattice"]
+        if heavy.material.density > light.material.density and abs(gap) < h and beside.all() and lattices:
+            what = f'"{heavy.name}" lies on the lighter "{light.name}": on a lattice its fall begins late.'
+            fix = f'Set sampling = "turned" for {several(quoted(lattices))}.'
+            yield Finding("note", "overturning", what, fix, heavy.material.density, heavy.name)
 
 
 def _floor(facts: SceneFacts) -> tuple[int, int | None]:

@@ -259,7 +259,7 @@ def check_ledger(entries: Sequence[Entry], header: RunHeader, findings: FrameFin
 
     # Mass that has entered or left is not counted. The median identifies a single faulty row, also the first.
     emitted = of.get("emitted_mass", np.zeros(len(rows)))
-    mass = of["mass"] - emitted + of.get("retired_mass", 0.0)
+    mass = of["mass"] - emitted - of.get("nozzle_mass", 0.0) + of.get("retired_mass", 0.0)
     usual = float(np.median(mass))
     scale, change = np.maximum(usual, emitted), np.abs(mass - usual)
     change = np.divide(change, scale, out=(change > 0).astype(float), where=scale > 0)

@@ -45,11 +45,11 @@ class LedgerRow:
             previous frame, J: negative while its springs take up energy. These two are None if no body separates.
         rigid_pose: centre of each free collider, m, and its angle, rad, or its unit quaternion, the real part first;
             rigid_motion: its velocity, m/s, and its angular velocity, rad/s. Its energies are included in those above,
-                its momenta are not. emitted, retired: particles that have entered from emitters so far, and that have
-                left through open faces; emitted_mass, retired_mass: their mass, kg. Sums are over the particles
-                present. blocked: particles of emitters that have found their place occupied so far. They never enter,
-                unless they are half of a sheet or more, which then waits. These five are None if no particle comes or
-                goes.
+                its momenta are not. emitted, retired: particles that passed mouths of emitters so far, and that left
+                through open faces; emitted_mass, retired_mass: their mass, kg; nozzle_mass: mass that has entered, but
+                not passed a mouth, kg. Sums are over the particles present. blocked: particles of emitters that have
+                found their place occupied so far. They never enter, unless they are half of a sheet or more, which then
+                waits. These six are None if no particle comes or goes.
 
     Velocities are those of the middle of the last step before `time`.
     """
@@ -81,6 +81,7 @@ class LedgerRow:
     rigid_motion: tuple[tuple[float, ...], ...] = ()
     emitted: int | None = None
     emitted_mass: float | None = None
+    nozzle_mass: float | None = None
     retired: int | None = None
     retired_mass: float | None = None
     blocked: int | None = None

@@ -149,7 +149,7 @@ def soft_bulk_modulus(
     modulus = min(max(pressure / compressibility, 1 / LARGEST), LARGEST)
     said = f"bulk_modulus = {modulus:.4g} Pa (sound speed {np.sqrt(modulus / density):.4g} m/s) lets the density "
     if pressure > dynamic:
-        cause = "with which colliders push the material" if pressure == bounds.load else "under which it yields"
+        cause = "of what pushes or draws it" if pressure == bounds.load else "under which it yields"
         return modulus, f"{said}vary by {100 * compressibility:.3g} % at {pressure:.4g} Pa, the pressure {cause}"
     impact = f"a hard impact at that speed reaches {100 * np.sqrt(compressibility):.3g} %"
     return modulus, (

@@ -214,7 +214,7 @@ COLUMNS = tuple(f.name for f in fields(LedgerRow))
 PER_PART = (*LOADS, *RIGID)
 VECTORS = ("linear_momentum", "angular_momentum")
 # Columns that some scenes and older results lack: None, and not stored.
-OPTIONAL = ("emitted", "emitted_mass", "retired", "retired_mass", "blocked")
+OPTIONAL = ("emitted", "emitted_mass", "nozzle_mass", "retired", "retired_mass", "blocked")
 OPTIONAL += ("collider_work", "contact_work", "contact_overlap")
 INTEGERS = ("steps", "emitted", "retired", "blocked")
 TEXT = "limit"

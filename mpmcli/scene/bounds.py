@@ -8,6 +8,7 @@ import numpy as np
 
 from mpmcli.scene.colliders import Collider
 from mpmcli.scene.displaced_flow import displaced_flow
+from mpmcli.scene.domain import STICKING
 from mpmcli.scene.entry import Entry, value_of, varies
 from mpmcli.scene.expression import INITIAL, POSITION, VELOCITY, Apply, Expression, Tree, bounds_of, names_in
 from mpmcli.scene.material import SceneBounds
@@ -16,7 +17,7 @@ from mpmcli.scene.primitives import box_corners, grid_points
 from mpmcli.scene.quadrature import parts_of
 from mpmcli.scene.sampling import estimate_body, initial_motion, moves_unevenly, particle_places
 from mpmcli.scene.schema import Body, Emitter, Force, Scene
-from mpmcli.scene.sheets import fastest_inflow
+from mpmcli.scene.sheets import fastest_inflow, mouth_of
 
 # Number of equal parts of a run, in addition to those in which a time-dependent term varies; largest number of parts.
 SLICES, MOST_SLICES = 32, 400
@@ -25,8 +26,12 @@ SLICES, MOST_SLICES = 32, 400
 CELLS, HALVINGS, MOST_CELLS = {2: 16, 3: 8}, 10, 4096
 # Largest number of particles of a body that are examined.
 MOST_PLACES = 4096
+# Shear rates at which a layer on a wall is tried, over six decades.
+RATES = 64
 # Instants at which cells are halved: those of the strongest forces.
 SEARCHED = 3
+# The suction that liquids bear at most, Pa, over density (w g/v)^2: a stream that requires more tears in any case.
+ATMOSPHERE, DRAWN = 101325.0, 0.5
 
 
 @dataclass(frozen=True)
@@ -236,7 +241,7 @@ def scene_bounds(scene: Scene, sources: Sequence[Body | Emitter] | None = None) 
     The speed is at least that of the fastest wall, of the fastest point of a collider, and of the material that
     colliders push through what is open; the load is the pressure with which they do (`displaced_flow`), or that of the
     weight of rigid bodies. Along a periodic axis there is no lowest point: gravity along it adds its impulse over the
-    run and no height.
+    run and no height, but no more than a layer reaches whose shear stress on a wall that sticks bears it.
 
     For time-dependent gravity, g is the largest magnitude and H the largest of any instant; the impulse also bounds the
     speed. Forces of magnitude a add min(2 a L, I^2) to the square of the speed, L the largest extent of the domain and
@@ -274,7 +279,7 @@ def scene_bounds(scene: Scene, sources: Sequence[Body | Emitter] | None = None) 
     weight = g if closed.all() else max(float(np.linalg.norm(gravity * closed)) for gravity in gravities)
     fallen = 2 * weight * height if scene.domain.steady else min(2 * weight * height, pull.impulse * pull.impulse)
     if not closed.all():
-        initial += max(float(np.linalg.norm(gravity[~closed])) for gravity in gravities) * scene.time.end
+        initial += max(_glide(scene, sources, corners, gravity) for gravity in gravities)
     pushed = min(2 * push.largest * max(scene.domain.size), push.impulse * push.impulse)
     weighted = g + push.largest
     speed = float(np.sqrt(initial * initial + fallen + pushed)) + sum(abs(one.strength) for one in scene.impulses)
@@ -283,14 +288,52 @@ def scene_bounds(scene: Scene, sources: Sequence[Body | Emitter] | None = None) 
     resisting = max((body.material.shear_stress_at(flow.rate, pressure) for body in sources), default=0.0)
     # What a joint or a fixed axis may bear does not count.
     heavy = [one for one in scene.colliders if one.free and not (one.fixed or one.joint)]
-    load = max([flow.pressure(density, resisting), *(_weight(one, gravities) for one in heavy)])
+    drawn = (_suction(body, scene, gravities) for body in sources if isinstance(body, Emitter))
+    load = max([flow.pressure(density, resisting), *(_weight(one, gravities) for one in heavy), *drawn])
     return SceneBounds(scene.dimension, scene.domain.spacing, weighted, speed, height, density, load)
+
+
+def _glide(scene: Scene, sources: Sequence[Body | Emitter], corners: np.ndarray, gravity: np.ndarray) -> float:
+    """Return the speed that gravity along periodic axes gives in the run, m/s, or until a wall that sticks bears it."""
+    closed, domain = ~np.array(scene.domain.periodic), scene.domain
+    along, across = (float(np.linalg.norm(gravity[axes])) for axes in (~closed, closed))
+    least = along * scene.time.end
+    for a, words in enumerate(domain.walls.faces(scene.dimension)):
+        for word, face, way in zip(words, (domain.origin[a], domain.upper[a]), (1.0, -1.0), strict=True):
+            depth = float((way * (corners[:, a] - face)).max())
+            if word in STICKING and depth > 0.0:
+                rates = np.array([0.0, *np.geomspace(1e-6, 1.0, RATES)]) * (along * scene.time.end / depth)
+                found = (_balanced(body, rates, depth, along, across) for body in sources)
+                least = min(least, max(found, default=rates[-1]) * depth)
+    return least
+
+
+def _balanced(body: Body | Emitter, rates: np.ndarray, depth: float, along: float, across: float) -> float:
+    """Return the first shear rate at which a layer bears its weight along it; the last one if none does."""
+    weight = body.material.density * depth
+    bears = [body.material.shear_stress_at(rate, weight * across) >= weight * along for rate in rates]
+    return float(rates[np.argmax(bears)] if any(bears) else rates[-1])
 
 
 def _weight(one: Collider, gravities: Sequence[np.ndarray]) -> float:
     """Return the weight of a rigid body over the area of its bounding box across gravity, Pa; the largest one."""
     extent = np.ptp(one.form.bounds(), axis=0)
     return max(float((np.abs(gravity) * extent).max() * one.moments.mass / extent.prod()) for gravity in gravities)
+
+
+def _suction(emitter: Emitter, scene: Scene, gravities: Sequence[np.ndarray]) -> float:
+    """Return density (w g/v)^2, Pa, of a stream of the width w that leaves a mouth at the speed v and falls freely.
+
+    Its sides start inwards at w g/(2 v), drawn by a suction of half of it.
+    """
+    mouth = mouth_of(emitter, scene.domain.spacing)
+    width = float((mouth.spacing[1:] * mouth.counts).min())
+    fall = max(float(gravity @ mouth.direction) for gravity in gravities)
+    speed = fastest_inflow(emitter, scene.time.end)
+    if not emitter.material.hydrostatic or fall <= 0.0 or speed <= 0.0:
+        return 0.0
+    load = emitter.material.density * (width * fall / speed) ** 2
+    return load if DRAWN * load < ATMOSPHERE else 0.0
 
 
 def highest_speed(body: Body | Emitter, end: float = math.inf) -> float:

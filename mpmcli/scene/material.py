@@ -91,7 +91,8 @@ class SceneBounds:
         speed: highest speed that any particle can reach, m/s, from initial speeds and fall height.
         height: extent of the matter along gravity that can press on its lowest point, m.
         density: largest density at rest of any body, kg/m^3, for the pressure on the others.
-        load: largest pressure with which colliders push the material, Pa.
+        load: largest pressure with which colliders push the material, or twice the suction that draws a stream together
+            where it begins to fall, Pa.
     """
 
     dimension: int

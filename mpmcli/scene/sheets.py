@@ -8,6 +8,7 @@ slow stream stretched by gravity would tear between sheets that are a particle d
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -85,6 +86,10 @@ class Sheets:
     def early(self) -> float:
         """How long before it passes the mouth a particle enters, s."""
         return self.lead / float(self.speeds[0]) if self.lead and self.count else 0.0
+
+    def passed(self, times: Sequence[float]) -> np.ndarray:
+        """Return how many particles have passed the mouth at some times, s, if none was blocked."""
+        return np.minimum(np.searchsorted(self.due + self.early, times, "right") * self.size, self.particles)
 
     def velocities(self) -> np.ndarray:
         """Return the velocities at which all particles enter, (n, d), m/s."""
@@ -211,14 +216,15 @@ def sheets_of(emitter: Emitter, scene: Scene) -> Sheets:
     speed = fastest_inflow(emitter, scene.time.end)
     period = float(mouth.spacing[0] / max(speed, _SLOWEST)) * size / max(1, layer)
     step = size if whole else 1
-    totals = [most_until_end(emitter, scene, period, size)]
+    lead = _lead(emitter, scene, mouth)
+    early = lead / max(speed, _SLOWEST)
+    totals = [most_until_end(emitter, scene, period, size, early)]
     totals += [emitter.particles] * (emitter.particles is not None)
     if emitter.volume is not None and volume > 0:
         totals.append(emitter.volume / volume)
     particles = step * max(1, round(min(totals) / step)) if totals[0] and layer else 0
     number = np.arange(-(-particles // max(1, size)))
-    lead = _lead(emitter, scene, mouth)
-    due, speeds = emitter.start - lead / max(speed, _SLOWEST) + number * period, np.full(len(number), speed)
+    due, speeds = emitter.start - early + number * period, np.full(len(number), speed)
     if varies(emitter.rate):
         times, flown = _flow(emitter, scene)
         due = np.interp(number * size * volume, flown, times)
@@ -258,9 +264,12 @@ def _flow(emitter: Emitter, scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     return times, np.concatenate([[0.0], np.cumsum((rates[1:] + rates[:-1]) / 2 * np.diff(times))])
 
 
-def most_until_end(emitter: Emitter, scene: Scene, period: float, size: int) -> int:
-    """Return the number of particles that enter until the end of an emitter or its scene, in sheets of a size."""
-    end = min(scene.time.end, math.inf if emitter.end is None else emitter.end)
+def most_until_end(emitter: Emitter, scene: Scene, period: float, size: int, early: float = 0.0) -> int:
+    """Return the number of particles that enter until the end of an emitter or its scene, in sheets of a size.
+
+    They enter `early` before they pass the mouth, s: the nozzle is full at the end of the scene.
+    """
+    end = min(scene.time.end + early, math.inf if emitter.end is None else emitter.end)
     sheets = (end - emitter.start) / period
     if varies(emitter.rate) and end > emitter.start:
         mouth = mouth_of(emitter, scene.domain.spacing)

@@ -232,6 +232,6 @@ def begin_emission(batch: object, slot: int, scene: Scene, particles: Sequence[i
         # A sheet enters at the first step after its due time; no sheet is due from `until` on.
         start = float(sheets.due[0]) if sheets.count else emitter.start
         run.due_of[e], run.period[e], run.sheets[e] = start, sheets.period, sheets.count
-        run.until[e] = min(scene.time.end, math.inf if emitter.end is None else emitter.end) - sheets.early
+        run.until[e] = min(scene.time.end, math.inf if emitter.end is None else emitter.end - sheets.early)
         if sheets.count and start < run.until[e]:
             run.due = min(run.due, start)

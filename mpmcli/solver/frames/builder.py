@@ -10,6 +10,7 @@ import numpy as np
 from mpmcli.frames.frame import ACTIVE, BLOCKED, RETIRED, STATUS, WAITING, Frame
 from mpmcli.frames.ledger import LOADS, RIGID, LedgerRow
 from mpmcli.scene import BodyParticles, Scene
+from mpmcli.scene.sheets import sheets_of
 from mpmcli.solver.frames.columns import FrameArrays, FrameColumns, ParticleConstants, RunConstants, parts_of
 from mpmcli.stability.transfer_factors import affine_moment
 
@@ -294,6 +295,7 @@ class FrameBuilder:
         shown = [*self._names, *columns]
         self.columns = FrameColumns(scene.dimension, internal, shown, particle_count_varies=scene.particle_count_varies)
         self._waits = np.array([b.waits for b in particles])
+        self._sheets = [sheets_of(emitter, scene) for emitter in scene.emitters]
         self._origin = np.array(scene.domain.origin)
         # Far from zero, single precision does not resolve neighbouring particles; the solver does, because its
         # positions are relative to the origin of the domain.
@@ -352,10 +354,10 @@ class FrameBuilder:
         last_steps = np.array([moment.last_step for moment in moments])
         spacing = scene.domain.spacing
         conserved = ledger_sums(sums, gravity, spacing, last_steps, affine_moment(scene.solver))
-        conserved |= totals.entries(constants.masses)
+        times, taken = [moment.time for moment in moments], [moment.taken for moment in moments]
+        conserved |= totals.entries(constants.masses, [one.passed(times) for one in self._sheets])
         if status is not None:
             conserved["blocked"] = np.array([moment.blocked for moment in moments])
-        times, taken = [moment.time for moment in moments], [moment.taken for moment in moments]
         durations, self.before = np.diff([self.before, *times]), times[-1]
         for name in moments[0].loads:
             found = np.array([moment.loads[name] for moment in moments])
@@ -428,8 +430,11 @@ class _Totals:
             ):
                 counts[t] += np.bincount(body[own], minlength=len(self._waits))
 
-    def entries(self, masses: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the entries of `LedgerRow` by name, (T,); `masses` are the particle masses of each body, kg."""
+    def entries(self, masses: np.ndarray, passed: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
+        """Return the entries of `LedgerRow` by name, (T,).
+
+        `masses` are the particle masses of each body, kg, `passed` the particles that passed the mouth of each emitter.
+        """
         # Without active particles the volume ratio is 1.
         none = self._low > self._high
         errors = [filled.errors() for _, filled in self._filled]
@@ -439,6 +444,10 @@ class _Totals:
             "volume_error": np.concatenate(errors) if errors else np.zeros(len(none)),
         }
         if self._particle_count_varies:
-            for name, counts in (("emitted", self._entered * self._waits), ("retired", self._retired)):
+            emitted, entered = np.zeros_like(self._entered), self._entered * self._waits
+            if passed:
+                emitted[:, self._waits] = np.minimum(np.transpose(passed), entered[:, self._waits])
+            for name, counts in (("emitted", emitted), ("retired", self._retired)):
                 found[name], found[f"{name}_mass"] = counts.sum(axis=1), counts @ masses
+            found["nozzle_mass"] = (entered - emitted) @ masses
         return found
