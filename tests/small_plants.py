@@ -127,7 +127,7 @@ WALLS = (
         ("poiseuille", "bingham"),
         missed="the node on the wall is stopped as well, so that images are a hundredth of the error of the grid",
     ),
-    *_of("boundaries/walls.py", ("mass * self.velocity(axis", "1.05 * mass * self.velocity(axis", "couette")),
+    *_of("boundaries/walls.py", ("mass * self.velocity_at(", "1.05 * mass * self.velocity_at(", "couette")),
     SmallPlant(
         "boundaries/mirror_images.py", "ti.cast(outward >= 0, int)", "ti.cast(outward > -1e30, int)", ("take_off",)
     ),

@@ -160,8 +160,8 @@ def test_volume_follows_the_grid(
 ) -> None:
     """J += share sgn(g) max(|g| - band, 0), g = 1/sum(w n) - J, where all n > FULL; share = a/(1 + a), a = rate c t/h.
 
-    Down to J = 1 all of g - DEAD_BAND or g + SLACK instead. It grows only where the nodes beside the stencil are
-    filled, too.
+    Down to J = 1 all of g - DEAD_BAND or g + SLACK instead, and below it at least to LARGEST_LACK less than 1/sum(w n)
+    or 1. It grows only where the nodes beside the stencil are filled, too.
 
     The same step without relaxation differs by that alone: positions, velocities and gradients have the same bytes.
     """
@@ -172,7 +172,7 @@ def test_volume_follows_the_grid(
     (group,) = run.groups
     # Too dense by a seventh, on average.
     random = np.random.default_rng(3)
-    group.replace(x=group.read()["x"] * [1.0, 0.85, 1.0][:d], deformation=random.uniform(0.9, 1.2, group.count))
+    group.replace(x=group.read()["x"] * [1.0, 0.85, 1.0][:d], deformation=random.uniform(0.7, 1.2, group.count))
     run.state_was_replaced()
     run.step(1e-4)
     saved = run.save().copied()
@@ -197,8 +197,10 @@ def test_volume_follows_the_grid(
     gap = np.where(gap > 0, np.clip(seen - 1, 0, gap), gap)
     share = RELAXATION * crossings / (1 + RELAXATION * crossings)
     expected = free + share * np.sign(gap) * np.maximum(np.abs(gap) - DEAD_BAND, 0)
-    for changed in (free[J >= 1] != J[J >= 1], expected != free, seen < free - LARGEST_LACK):
+    held = np.where(moves & (seen > J), np.minimum(seen, 1) - LARGEST_LACK, 0)
+    for changed in (free[J >= 1] != J[J >= 1], expected != free, seen < free - LARGEST_LACK, held > expected):
         assert 0.02 < changed.mean() < 0.98
+    expected = np.maximum(expected, held)
     if len(densities) == 1:
         # Of two layers one keeps a share of its C, which is not the one by which volumes grow.
         assert plain["deformation"] == pytest.approx(grown(J, plain["C"], 1e-4), abs=1e-13)

@@ -128,8 +128,8 @@ class MirrorImages:
                                 total[c] += share * impulse[c]
             for a in ti.static(self.walls.axes):
                 if acts[a] == 1 and depth[a] == 0:
-                    total = self.walls.stopped(total, a, holds, upper, total[self.dimension])
-            if ti.static(self.walls.moves):
+                    total = self.walls.stopped(total, a, depth, holds, upper, total[self.dimension])
+            if ti.static(self.walls.slips):
                 total = self.walls.closed(total, acts, depth)
         return total
 
@@ -142,7 +142,7 @@ class MirrorImages:
         every = self.every_image(acts, depth)
         for images in range(self.image_sets(every)):
             if images & every == images:
-                mirrored = self.mirrored_value(value, images, holds, upper, 1.0)
+                mirrored = self.mirrored_value(value, images, depth, holds, upper, 1.0)
                 grid.set_part(self.image(grid, node, mirror, images), first, mirrored)
 
     @ti.func
@@ -168,7 +168,7 @@ class MirrorImages:
         for images in range(self.image_sets(every)):
             if images & every == images:
                 value = pulled(grid.part(self.image(grid, node, mirror, images), first), self.dimension, gravity_step)
-                total += self.mirrored_value(value, images, holds, upper, value[self.dimension])
+                total += self.mirrored_value(value, images, depth, holds, upper, value[self.dimension])
         return total
 
     @ti.func
@@ -199,7 +199,13 @@ class MirrorImages:
 
     @ti.func
     def mirrored_value(
-        self, value: ti.template(), images: int, holds: ti.template(), upper: ti.template(), mass: float
+        self,
+        value: ti.template(),
+        images: int,
+        depth: ti.template(),
+        holds: ti.template(),
+        upper: ti.template(),
+        mass: float,
     ):
         """Return a mirrored momentum, or with mass 1 a mirrored velocity: reflected about the velocity of the wall.
 
@@ -218,20 +224,20 @@ class MirrorImages:
                         elif holds[a] == 1:
                             result[c] = -result[c]
         if ti.static(self.walls.moves):
-            shift = self.shift(images, holds, upper)
+            shift = self.shift(images, depth, holds, upper)
             for c in ti.static(range(self.dimension)):
                 result[c] += mass * shift[c]
         return result
 
     @ti.func
-    def shift(self, images: int, holds: ti.template(), upper: ti.template()):
+    def shift(self, images: int, depth: ti.template(), holds: ti.template(), upper: ti.template()):
         """Return the term of wall velocities in a mirrored velocity: twice that of the last wall that reverses it."""
         result = ti.Vector.zero(float, self.dimension)
         turned = ti.Vector.zero(int, self.dimension)
         for i, a in ti.static(enumerate(self.walls.axes)):
             if ti.static(a not in self.walls.periodic):
                 if images >> i & 1 == 1:
-                    along = self.walls.velocity(a, upper[a])
+                    along = self.walls.velocity_at(a, upper[a], depth)
                     for c in ti.static(range(self.dimension)):
                         # The normal velocity of a wall is zero.
                         turns = 1
@@ -408,6 +414,8 @@ def column_friction(
     holds = images.walls.holding(node, depth, upper, False)
     pressed, others = False, 0
     for a in ti.static(range(d)):
+        if images.walls.ends(a, depth) and a != axis:
+            along[a] = 0.0
         if a == axis:
             pressed = acts[a] == 1
             acts[a] = 0

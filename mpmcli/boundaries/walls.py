@@ -190,13 +190,11 @@ class Walls:
         result = velocity
         for a in ti.static(self.axes):
             if acts[a] == 1 and depth[a] == 0:
-                result = self.stopped(result, a, holds, upper, 1.0)
+                result = self.stopped(result, a, depth, holds, upper, 1.0)
             elif acts[a] != AWAY and depth[a] <= self.shut:
                 inward = result[a] if upper[a] == 0 else -result[a]
                 if inward < 0:
                     result[a] = 0.0
-        if ti.static(self.moves):
-            result = self.closed(result, acts, depth)
         return result
 
     @ti.func
@@ -311,7 +309,7 @@ class Walls:
         result = ti.Matrix.zero(float, self.dimension, self.dimension)
         if ti.static(self.moves):
             for a in ti.static(self.axes):
-                own = self.velocity(a, upper[a])
+                own = self.velocity_at(a, upper[a], depth)
                 for c in ti.static(range(self.dimension)):
                     result[a, c] = own[c]
         for r, _number, axis, side in ti.static(self.rough):
@@ -323,7 +321,13 @@ class Walls:
 
     @ti.func
     def stopped(
-        self, value: ti.template(), axis: ti.template(), holds: ti.template(), upper: ti.template(), mass: float
+        self,
+        value: ti.template(),
+        axis: ti.template(),
+        depth: ti.template(),
+        holds: ti.template(),
+        upper: ti.template(),
+        mass: float,
     ):
         """Return momentum, or velocity with mass 1, on an acting wall: no normal part, the wall's own if it sticks."""
         result = value
@@ -332,14 +336,14 @@ class Walls:
                 result[c] = 0.0
             elif holds[axis] == 1:
                 if ti.static(self.moves):
-                    result[c] = mass * self.velocity(axis, upper[axis])[c]
+                    result[c] = mass * self.velocity_at(axis, upper[axis], depth)[c]
                 else:
                     result[c] = 0.0
         return result
 
     @ti.func
     def closed(self, value: ti.template(), acts: ti.template(), depth: ti.template()):
-        """Return the value without the part that a moving wall drives through another wall at a common edge."""
+        """Return the value without the part that the slip at one wall drives through another one at a common edge."""
         result = value
         for a in ti.static(self.axes):
             if acts[a] == 1 and depth[a] == 0:
@@ -359,4 +363,25 @@ class Walls:
                     if upper == ti.static(self.moving.faces[f][1]):
                         for c in ti.static(range(self.dimension)):
                             result[c] = self.moving.of(f)[c]
+        return result
+
+    @ti.func
+    def velocity_at(self, axis: ti.template(), upper: int, depth: ti.template()):
+        """Return the velocity of the face of `axis` at a node, m/s: nothing towards a wall at most a cell away."""
+        result = self.velocity(axis, upper)
+        if ti.static(not self.slips):
+            for c in ti.static(self.lateral[axis]):
+                if self.ends(c, depth):
+                    result[c] = 0.0
+        return result
+
+    @ti.func
+    def ends(self, axis: ti.template(), depth: ti.template()):
+        """Return whether walls that move along `axis` have ended at a node: a cell before a wall that they run into.
+
+        Continuity leaves the velocity no slope across a wall that sticks; one would crush what touches both walls.
+        """
+        result = False
+        if ti.static(axis not in self.periodic):
+            result = depth[axis] <= 1
         return result

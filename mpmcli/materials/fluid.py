@@ -172,6 +172,7 @@ def relaxed_volume(J: float, seen: float, crossings: float, rate: float, opens: 
     room = ti.max(ti.min(gap, seen - 1.0) - DEAD_BAND, 0.0)
     change = opens * room + ti.min(gap + DEAD_BAND, 0.0)
     change *= rate * crossings / (1.0 + rate * crossings)
+    change += opens * ti.max(ti.min(seen, 1.0) - LARGEST_LACK - free - change, 0.0)
     return free + change, ti.abs(change)
 
 

@@ -15,7 +15,7 @@ import math
 from collections.abc import Sequence
 
 from mpmcli.materials.elementary import exp, exp_minus_1, log
-from mpmcli.materials.fluid import BESIDE, DEAD_BAND, FULL
+from mpmcli.materials.fluid import BESIDE, DEAD_BAND, FULL, LARGEST_LACK
 from mpmcli.materials.law import SMALLEST, Law
 from mpmcli.materials.tensors import volume_strain
 from mpmcli.quick_taichi import ti
@@ -269,7 +269,8 @@ def relax_volume(group: ti.template(), grid: ti.template(), last: ti.template(),
         filled = held * scale
         relaxes = least * scale > FULL
         # In the dead band of the law, where most particles are, it does not matter.
-        if relaxes and 1.0 / filled > ti.max(volume_ratio(group, group.stored(p)), 1.0) + DEAD_BAND:
+        J = volume_ratio(group, group.stored(p))
+        if relaxes and 1.0 / filled > ti.min(ti.max(J, 1.0) + DEAD_BAND, J + LARGEST_LACK):
             opens = ti.select(held_beside(x, grid, last) > BESIDE * held, 1.0, 0.0)
     if relaxes:
         seen = 1.0 / filled
