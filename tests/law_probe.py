@@ -89,10 +89,11 @@ class LawProbe:
     ) -> Response:
         """Return the response to states F (n, d, d), of which a law that keeps J gets det F.
 
-        `internal` is (n, number of internal variables), at rest where None; C is (n, d, d), 0 where None.
+        `internal` is (n, number of internal variables), at rest where None or left out; C is (n, d, d), 0 where None.
         """
         n, d = len(F), self.dimension
-        internal = self.at_rest(n) if internal is None else internal
+        given = np.zeros((n, 0)) if internal is None else internal
+        internal = np.hstack([given, self.at_rest(n)[:, given.shape[1] :]])
         keeps_F = self.law.deformation == "F"
         given = F if keeps_F else np.linalg.det(F)[:, None, None]
         padded = np.zeros((n, max(internal.shape[1], 1)))

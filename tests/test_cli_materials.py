@@ -64,6 +64,7 @@ def test_parameters_have_the_units_of_their_descriptions():
         "cohesion": {"Pa"},
         "consistency": {"Pa s^n"},
         "friction_angle": {"degrees"},
+        "friction_delay": {"s"},
         "repose_angle": {"degrees"},
     }
 

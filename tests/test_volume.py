@@ -240,7 +240,7 @@ def test_sand_follows_the_grid(backend_of: Callable, monkeypatch: pytest.MonkeyP
     random = np.random.default_rng(3)
     strain = np.where(random.uniform(size=group.count) < 0.5, -0.02, 0.0)
     opened = np.where(strain < 0, 0.0, random.uniform(0, 0.3, group.count))
-    group.replace(deformation=np.exp(strain / 2)[:, None, None] * np.eye(2), internal=opened[:, None])
+    group.replace(deformation=np.exp(strain / 2)[:, None, None] * np.eye(2), internal=np.stack([opened, 0 * opened], 1))
     # What is at rest stays as it is.
     group.replace(v=np.zeros((group.count, 2)), C=random.normal(size=(group.count, 2, 2)))
     saved = run.save().copied()

@@ -25,7 +25,7 @@ from mpmcli.scene.material import Internal, Knob, SceneBounds
 from mpmcli.scene.quantity import LARGEST, Flag, NotNegative, flaw, scene_dimension
 
 # Places in the vector of constants.
-MU, LAMBDA, TIP, SLOPE, CORRECTION, SOUND_SPEED = range(6)
+MU, LAMBDA, TIP, SLOPE, CORRECTION, SOUND_SPEED, DELAY = range(7)
 
 # Dense sand, 24 to 96 MPa (US Army Corps of Engineers, EM 1110-1-1904, Settlement analysis, 1990).
 REAL_MODULUS = 5e7
@@ -37,6 +37,8 @@ BAND = 0.025
 # Fraction of the rest by which sand under pressure opens while sound crosses a cell. With a tenth, as for fluids,
 # scattered sand stays up to 3 % too voluminous.
 RELAXATION = 0.0175
+# Largest ratio of pressure and the delayed pressure, both ways.
+BEHIND = 1.25
 # Above this angle, degrees, the cone in 3D admits a tensile principal stress.
 STEEPEST_3D = 60.0
 _PULLED = "above which the yield cone lets sand be pulled"
@@ -80,10 +82,19 @@ class SandParameters(HenckyParameters):
         "again before it bears pressure. False makes it gain volume each time it is stirred.",
     )
 
+    friction_delay: NotNegative | Literal["auto"] = Field(
+        "auto",
+        description='Time after which friction follows the pressure, s; "auto" is that of a pressure wave through the '
+        "deepest column. At 0 steady shear excites waves, which lower the friction by up to a third.",
+    )
+
     sets: ClassVar[Mapping[str, str]] = {"repose_angle": "friction_angle"}
     internal: ClassVar[tuple[Internal, ...]] = (
         Internal(
             "plastic_volume_strain", 0.0, "Volume gained by coming apart, as the logarithm of a ratio, dimensionless."
+        ),
+        Internal(
+            "delayed_volume_strain", 0.0, "Elastic volume strain whose pressure sets the friction, dimensionless."
         ),
     )
 
@@ -123,24 +134,32 @@ class SandParameters(HenckyParameters):
             raise flaw(f"must be at most {STEEPEST_3D:g} degrees in 3D, {_PULLED}; found {value:g}")
         return value
 
+    @property
+    def sound_speed(self) -> float:
+        """Speed of pressure waves, m/s."""
+        return math.sqrt((self.lame_lambda + 2 * self.shear_modulus) / self.density)
+
     def shear_stress_at(self, rate: float, pressure: float) -> float:
         angle = math.radians(self.friction_angle)
         return pressure * math.sin(angle) + self.cohesion * math.cos(angle)
 
     def resolve(self, bounds: SceneBounds) -> tuple[Self, list[str]]:
-        """Replace "auto" by the softest modulus that the scene allows, at most that of real sand."""
-        if self.youngs_modulus != "auto":
-            return self, []
-        soft, under = soft_youngs_modulus(self, bounds)
-        modulus = min(max(min(soft, REAL_MODULUS), MODULUS_PER_STRENGTH * self.cohesion), LARGEST)
-        varies = f"the density vary by {100 * self.compressibility * soft / modulus:.3g} %"
-        if modulus < soft:
-            said = f"youngs_modulus = {modulus:.4g} Pa, that of real sand, lets {varies} {under}"
-        elif modulus > soft:
-            said = f"youngs_modulus = {modulus:.4g} Pa keeps the strain at which the cohesion gives way near 0.5 %"
-        else:
-            said = f"youngs_modulus = {modulus:.4g} Pa lets {varies} {under}"
-        return self.model_copy(update={"youngs_modulus": modulus}), [said]
+        """Replace "auto" by the softest modulus that the scene allows, at most that of real sand, and by a delay."""
+        chosen, told = self, []
+        if self.youngs_modulus == "auto":
+            soft, under = soft_youngs_modulus(self, bounds)
+            modulus = min(max(min(soft, REAL_MODULUS), MODULUS_PER_STRENGTH * self.cohesion), LARGEST)
+            varies = f"the density vary by {100 * self.compressibility * soft / modulus:.3g} %"
+            if modulus < soft:
+                said = f"youngs_modulus = {modulus:.4g} Pa, that of real sand, lets {varies} {under}"
+            elif modulus > soft:
+                said = f"youngs_modulus = {modulus:.4g} Pa keeps the strain at which the cohesion gives way near 0.5 %"
+            else:
+                said = f"youngs_modulus = {modulus:.4g} Pa lets {varies} {under}"
+            chosen, told = self.model_copy(update={"youngs_modulus": modulus}), [said]
+        if self.friction_delay == "auto":
+            chosen = chosen.model_copy(update={"friction_delay": bounds.height / chosen.sound_speed})
+        return chosen, told
 
 
 @ti.data_oriented
@@ -178,14 +197,14 @@ class Sand(HenckyLaw):
         self.relaxes = self.closes
 
     def constants(self, parameters: SandParameters) -> tuple[float, ...]:
-        """Return mu, lambda, volume strain at the tip, |dev e| per volume strain below it, correction, sound speed."""
+        """Return mu, lambda, volume strain at the tip, |dev e| per volume strain below it, and the others in order."""
         mu, lam = parameters.shear_modulus, parameters.lame_lambda
         bulk = lam + 2 * mu / self.dimension
         phi = math.radians(parameters.friction_angle)
         tip = parameters.cohesion / (math.tan(phi) * bulk)
         slope = math.sqrt(2) * math.sin(phi) * bulk / (2 * mu)
-        sound_speed = math.sqrt((lam + 2 * mu) / parameters.density)
-        return (mu, lam, tip, slope, float(parameters.volume_correction), sound_speed)
+        delay = 0.0 if parameters.friction_delay == "auto" else parameters.friction_delay
+        return (mu, lam, tip, slope, float(parameters.volume_correction), parameters.sound_speed, delay)
 
     def total_volume_ratio(self, J: np.ndarray, internal: Mapping[str, np.ndarray]) -> np.ndarray:
         return J * np.exp(internal["plastic_volume_strain"])
@@ -206,7 +225,12 @@ class Sand(HenckyLaw):
                 closed = ti.min(constants[CORRECTION] * v[0], -volume)
         kept = ti.min(volume + closed, constants[TIP])
         shear = ti.sqrt(deviator.dot(deviator))
-        strength = constants[SLOPE] * (constants[TIP] - kept)
+        bears = kept
+        if constants[DELAY] > 0.0 and kept < 0.0:
+            bears = v[1] + (kept - v[1]) * dt / (dt + constants[DELAY])
+            bears = ti.max(ti.min(bears, kept / BEHIND), kept * BEHIND)
+        v[1] = bears
+        strength = constants[SLOPE] * (constants[TIP] - bears)
         if kept != volume or shear > strength or s.min() < STRETCH_MIN:
             if shear > strength:
                 deviator *= strength / shear
