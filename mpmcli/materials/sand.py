@@ -37,8 +37,8 @@ BAND = 0.025
 # Fraction of the rest by which sand under pressure opens while sound crosses a cell. With a tenth, as for fluids,
 # scattered sand stays up to 3 % too voluminous.
 RELAXATION = 0.0175
-# Largest ratio of pressure and the delayed pressure, both ways.
-BEHIND = 1.25
+# Largest ratio of the pressure and the delayed one, both ways. With 1.05 a thin flow has 1.5 % less friction.
+BEHIND = 1.02
 # Above this angle, degrees, the cone in 3D admits a tensile principal stress.
 STEEPEST_3D = 60.0
 _PULLED = "above which the yield cone lets sand be pulled"
@@ -226,7 +226,8 @@ class Sand(HenckyLaw):
         kept = ti.min(volume + closed, constants[TIP])
         shear = ti.sqrt(deviator.dot(deviator))
         bears = kept
-        if constants[DELAY] > 0.0 and kept < 0.0:
+        # Without an earlier pressure there is no delay: where sand lands, and at the start.
+        if constants[DELAY] > 0.0 and kept < 0.0 and v[1] < 0.0:
             bears = v[1] + (kept - v[1]) * dt / (dt + constants[DELAY])
             bears = ti.max(ti.min(bears, kept / BEHIND), kept * BEHIND)
         v[1] = bears
