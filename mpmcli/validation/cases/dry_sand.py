@@ -127,7 +127,7 @@ class SandShear(Case):
         end = REACH * SIZE / WAVE_SPEED
         rate, stretch = SHEAR / end, math.exp(SQUEEZE / 2)
         domain, (shape,) = free_blocks(n, SIZE, 1, (4, 4))
-        material = elastic("sand", DENSITY, YOUNG, NU, friction_angle=FRICTION)
+        material = elastic("sand", DENSITY, YOUNG, NU, friction_angle=FRICTION, friction_delay=0.0)
         start = {"velocity_gradient": [[-rate, 0.0], [0.0, rate]], "deformation": [[stretch, 0.0], [0.0, stretch]]}
         return problem(domain, (end, 1), "velocity stress initial_position", [body("sand", material, shape, **start)])
 
