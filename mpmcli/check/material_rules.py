@@ -183,7 +183,7 @@ def _submerged(facts: SceneFacts) -> Iterator[Finding]:
         what = (
             f"The pressure of {several(quoted(liquids))} on {several(quoted(sand))} counts for its friction, because "
         )
-        what += "no liquid enters its pores: where it is submerged it holds slopes of any angle."
+        what += "no liquid enters its pores: where it is submerged it holds steep slopes."
         fix = "To let it slide, leave the liquid out, and lower the density of the sand by that of the liquid."
         yield Finding("note", "submerged", what, fix, len(sand), sand[0])
 
