@@ -40,8 +40,9 @@ SWING, CLOSED = 0.5 / END, 0.995
 OPENING = (CLOSED - math.cos(SWING * END)) / math.sin(SWING * END)
 
 METAL = elastic("von_mises", DENSITY, YOUNG, NU, yield_stress=YIELD, hardening_modulus=HARDENING)
-DAMP = elastic("sand", DENSITY, YOUNG, NU, friction_angle=FRICTION, cohesion=COHESION)
-DRY = elastic("sand", DENSITY, YOUNG, NU, friction_angle=FRICTION)
+# Friction that follows the pressure late would be judged with the cone.
+DAMP = elastic("sand", DENSITY, YOUNG, NU, friction_angle=FRICTION, cohesion=COHESION, friction_delay=0.0)
+DRY = elastic("sand", DENSITY, YOUNG, NU, friction_angle=FRICTION, friction_delay=0.0)
 SNOW = elastic(
     "snow", DENSITY, YOUNG, NU, critical_compression=COMPRESSION, critical_stretch=STRETCH, hardening=SNOW_HARDENING
 )
