@@ -109,7 +109,7 @@ def sweep_command(
 
 @click.group("dataset")
 def dataset_command() -> None:
-    """Inspect, verify and merge datasets of `mpmcli sweep`."""
+    """Inspect, verify and merge datasets of `mpmcli sweep`, and audit exports."""
 
 
 @dataset_command.command("status", epilog="Example: mpmcli dataset status datasets/drops")
@@ -143,6 +143,21 @@ def verify(dataset: Path, quiet: bool, as_json: bool) -> int:
             verification = verify(dataset, lambda done, total: bar.show(done))
     print_answer(verification, as_json)
     return 1 if verification.faults else 0
+
+
+@dataset_command.command("audit", epilog="Example: mpmcli dataset audit exports/drops")
+@click.argument("export", type=PATH)
+@json_option
+def audit_export(export: Path, as_json: bool) -> int:
+    """Judge the files of EXPORT, of mpmcli or others, by rules: gravity, dt, bounds, frames, statistics, leakage ...
+
+    The exit code is 1 if a rule has a finding. Rules whose facts are absent are skipped.
+    """
+    from mpmcli.dataset.audit import audit
+
+    audited = audit(export)
+    print_answer(audited, as_json)
+    return 1 if audited.findings else 0
 
 
 @dataset_command.command("card", epilog="Example: mpmcli dataset card datasets/drops")
