@@ -227,7 +227,7 @@ class Sand(HenckyLaw):
         shear = ti.sqrt(deviator.dot(deviator))
         bears = kept
         # Without an earlier pressure there is no delay: where sand lands, and at the start.
-        if constants[DELAY] > 0.0 and kept < 0.0 and v[1] < 0.0:
+        if constants[DELAY] > 0.0 and kept < 0.0:
             bears = v[1] + (kept - v[1]) * dt / (dt + constants[DELAY])
             bears = ti.max(ti.min(bears, kept / BEHIND), kept * BEHIND)
         v[1] = bears
