@@ -311,7 +311,8 @@ def _glide(scene: Scene, sources: Sequence[Body | Emitter], corners: np.ndarray,
 def _balanced(body: Body | Emitter, rates: np.ndarray, depth: float, along: float, across: float) -> float:
     """Return the first shear rate at which a layer bears its weight along it; the last one if none does."""
     weight = body.material.density * depth
-    bears = [body.material.shear_stress_at(rate, weight * across) >= weight * along for rate in rates]
+    with np.errstate(over="ignore"):
+        bears = [body.material.shear_stress_at(rate, weight * across) >= weight * along for rate in rates]
     return float(rates[np.argmax(bears)] if any(bears) else rates[-1])
 
 
@@ -332,7 +333,8 @@ def _suction(emitter: Emitter, scene: Scene, gravities: Sequence[np.ndarray]) ->
     speed = fastest_inflow(emitter, scene.time.end)
     if not emitter.material.hydrostatic or fall <= 0.0 or speed <= 0.0:
         return 0.0
-    load = emitter.material.density * (width * fall / speed) ** 2
+    starts = width * fall / speed
+    load = emitter.material.density * starts * starts
     return load if DRAWN * load < ATMOSPHERE else 0.0
 
 
