@@ -96,6 +96,7 @@ def test_files_are_found_where_the_base_is(scene, tmp_path: Path) -> None:
     [
         ('remove = ["drop"]\n', "base: missing key: the scene whose names `remove` leaves out"),
         ("base = 3\n", "base: must be the path of a scene in quotes; found 3"),
+        ('base = "a\\u0000b"\n', "base: must be the path of a scene in quotes; found 'a\\x00b'"),
         ('base = "nowhere.toml"\n', "there is no such file"),
         ('base = "scene.toml"\n', "base: scene.toml has this scene as its base in turn"),
         ('base = "base.toml"\nremove = ["dorp"]\n', 'remove: nothing has the name "dorp"; did you mean "drop"?'),

@@ -261,7 +261,7 @@ def read_scene(path: str | PathLike[str], seen: Sequence[File] = ()) -> tuple[st
         return text, data
     if name is None:
         raise InputError(f"{path}: base: missing key: the scene whose names `remove` leaves out")
-    if not isinstance(name, str):
+    if not isinstance(name, str) or "\0" in name:
         raise InputError(f"{path}: base: must be the path of a scene in quotes; found {name!r}")
     if not isinstance(remove, list) or not all(isinstance(one, str) for one in remove):
         raise InputError(f"{path}: remove: must be a list of names in quotes; found {remove!r}")
