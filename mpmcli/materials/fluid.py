@@ -135,9 +135,9 @@ def soft_bulk_modulus(
 ) -> tuple[float, str]:
     """Return K = p / compressibility, Pa, and a sentence that states it.
 
-    The pressure p is the largest of density v^2, with v the highest speed, of the load by colliders, and of the
-    `strength`, Pa, under which the material at rest yields. The density is the largest of all bodies that can reach the
-    fluid, because a denser one may press on it.
+    The pressure p is the largest of density v^2, with v the highest speed, of the load by colliders, of what draws a
+    stream together, and of the `strength`, Pa, under which the material at rest yields. The density is the largest of
+    all bodies that can reach the fluid, because a denser one may press on it.
 
     The density of weakly compressible flow varies by v^2/c^2 (Monaghan 1994). A column released without
     compression reaches a pressure of 2 density g H = density v^2, the same bound. In a head-on impact on fluid or a
@@ -145,12 +145,19 @@ def soft_bulk_modulus(
     """
     speed = bounds.speed if bounds.speed > 0 else QUIET_SPEED
     dynamic = max(density, bounds.density) * speed**2
-    pressure = max(dynamic, bounds.load, strength)
+    # What requires more suction than one atmosphere tears in any case.
+    drawn = bounds.drawn if bounds.drawn < 2 * ATMOSPHERE else 0.0
+    pressure = max(dynamic, bounds.load, drawn, strength)
     modulus = min(max(pressure / compressibility, 1 / LARGEST), LARGEST)
     said = f"bulk_modulus = {modulus:.4g} Pa (sound speed {np.sqrt(modulus / density):.4g} m/s) lets the density "
     if pressure > dynamic:
-        cause = "of what pushes or draws it" if pressure == bounds.load else "under which it yields"
-        return modulus, f"{said}vary by {100 * compressibility:.3g} % at {pressure:.4g} Pa, the pressure {cause}"
+        causes = {
+            strength: "under which it yields",
+            drawn: "at which a stream is drawn together",
+            bounds.load: "with which colliders push the material",
+        }
+        said += f"vary by {100 * compressibility:.3g} % at {pressure:.4g} Pa"
+        return modulus, f"{said}, the pressure {causes[pressure]}"
     impact = f"a hard impact at that speed reaches {100 * np.sqrt(compressibility):.3g} %"
     return modulus, (
         f"{said}of smooth flow vary by {100 * compressibility:.3g} % at the highest speed, {speed:.4g} m/s; {impact}"

@@ -30,8 +30,6 @@ MOST_PLACES = 4096
 RATES = 64
 # Instants at which cells are halved: those of the strongest forces.
 SEARCHED = 3
-# The suction that liquids bear at most, Pa, over density (w g/v)^2: a stream that requires more tears in any case.
-ATMOSPHERE, DRAWN = 101325.0, 0.5
 
 
 @dataclass(frozen=True)
@@ -288,9 +286,9 @@ def scene_bounds(scene: Scene, sources: Sequence[Body | Emitter] | None = None) 
     resisting = max((body.material.shear_stress_at(flow.rate, pressure) for body in sources), default=0.0)
     # What a joint or a fixed axis may bear does not count.
     heavy = [one for one in scene.colliders if one.free and not (one.fixed or one.joint)]
-    drawn = (_suction(body, scene, gravities) for body in sources if isinstance(body, Emitter))
-    load = max([flow.pressure(density, resisting), *(_weight(one, gravities) for one in heavy), *drawn])
-    return SceneBounds(scene.dimension, scene.domain.spacing, weighted, speed, height, density, load)
+    load = max([flow.pressure(density, resisting), *(_weight(one, gravities) for one in heavy)])
+    drawn = max([0.0, *(_suction(body, scene, gravities) for body in sources if isinstance(body, Emitter))])
+    return SceneBounds(scene.dimension, scene.domain.spacing, weighted, speed, height, density, load, drawn)
 
 
 def _glide(scene: Scene, sources: Sequence[Body | Emitter], corners: np.ndarray, gravity: np.ndarray) -> float:
@@ -325,17 +323,20 @@ def _weight(one: Collider, gravities: Sequence[np.ndarray]) -> float:
 def _suction(emitter: Emitter, scene: Scene, gravities: Sequence[np.ndarray]) -> float:
     """Return density (w g/v)^2, Pa, of a stream of the width w that leaves a mouth at the speed v and falls freely.
 
-    Its sides start inwards at w g/(2 v), drawn by a suction of half of it.
+    Its sides start inwards at w g/(2 v), drawn by a suction of half of it. It is 0 where viscosity bears the stream:
+    density v w < 3 viscosity.
     """
     mouth = mouth_of(emitter, scene.domain.spacing)
     width = float((mouth.spacing[1:] * mouth.counts).min())
     fall = max(float(gravity @ mouth.direction) for gravity in gravities)
     speed = fastest_inflow(emitter, scene.time.end)
-    if not emitter.material.hydrostatic or fall <= 0.0 or speed <= 0.0:
+    material = emitter.material
+    if not material.hydrostatic or min(fall, speed, width) <= 0.0:
         return 0.0
     starts = width * fall / speed
-    load = emitter.material.density * starts * starts
-    return load if DRAWN * load < ATMOSPHERE else 0.0
+    drawn = material.density * starts * starts
+    viscous = 3 * material.shear_stress_at(speed / width, 0.0) > material.density * speed * speed
+    return 0.0 if viscous else drawn
 
 
 def highest_speed(body: Body | Emitter, end: float = math.inf) -> float:

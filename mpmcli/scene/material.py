@@ -91,8 +91,8 @@ class SceneBounds:
         speed: highest speed that any particle can reach, m/s, from initial speeds and fall height.
         height: extent of the matter along gravity that can press on its lowest point, m.
         density: largest density at rest of any body, kg/m^3, for the pressure on the others.
-        load: largest pressure with which colliders push the material, or twice the suction that draws a stream together
-            where it begins to fall, Pa.
+        load: largest pressure with which colliders push the material, Pa.
+        drawn: twice the largest suction that draws a stream together where it begins to fall, Pa.
     """
 
     dimension: int
@@ -102,6 +102,7 @@ class SceneBounds:
     height: float
     density: float = 0.0
     load: float = 0.0
+    drawn: float = 0.0
 
 
 class Internal(NamedTuple):
