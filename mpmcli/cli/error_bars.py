@@ -22,14 +22,16 @@ BAR_OPTIONS = ("bar_level", "budget", "only", "skip", "confidence", "observe", "
 
 def bar_options(command: Callable) -> Callable:
     """Add the options of error bars to a command."""
-    level = "Siblings: grids are two coarser ones, 0.5 runs; step adds half a step, 3.5; all placement and samples, 9."
+    level = "Siblings: grids are coarser ones, 0.9 runs; step adds half a step, 4; all placement and samples, 9."
     mean = "Also the mean over the particles of an expression of x, y, z, vx, vy, vz and t. May be repeated."
     for option in (
         click.option(
             "--level", "bar_level", type=click.Choice(["grids", "step", "all"]), help=f"{level}  [default: grids]"
         ),
         click.option("--budget", type=options.duration, metavar="TIME", help="Take the level that fits: 10m, 2h."),
-        click.option("--only", multiple=True, metavar="CAUSE", help="Only grid, rounding, step, placement or sample."),
+        click.option(
+            "--only", multiple=True, metavar="CAUSE", help="Only grid, model, rounding, step, placement, sample."
+        ),
         click.option("--skip", multiple=True, metavar="CAUSE", help="Leave out such a cause. May be repeated."),
         click.option("--confidence", type=click.Choice(["90", "95"]), help="Percent, of the bars.  [default: 90]"),
         click.option("--observe", multiple=True, metavar="NAME=EXPRESSION", help=mean),
@@ -86,7 +88,7 @@ def study_result(loaded: "LoadedScene", result: "Result", plan: "StudyPlan", *, 
 
     record = result.record or {}
     seconds = float(record.get("timings", {}).get("solve_s", 0.0))
-    student = Student(loaded, plan)
+    student = Student(loaded, plan, [body.chosen for body in result.header.bodies])
     base = student.base_of(result, seconds, int(record.get("steps", 0)))
     _tell_cost(plan, loaded, seconds, quiet=quiet)
     with interrupts_wait():

@@ -1,15 +1,16 @@
 """The formula: bars of the observables of a run from those of its siblings.
 
 The bar of the grid takes the error as of first order, so that a difference of a grid r times coarser gives
-|q_rh - q_h| / (r - 1), and the larger of those of two grids; orders that three grids show are mostly spurious. Any
-other cause has its largest difference. Differences are the largest within WINDOW of the duration around each time: one
-that crosses 0 proves nothing. The bar is the root of the sum of squares of the causes. docs/validation.md has the
-study.
+|q_rh - q_h| / (r - 1), and the larger of those of two grids, but at least MARGIN of the smaller one: an error of first
+order would equal its bar. Orders that three grids show are mostly spurious. Another choice of the model counts where
+it moves an observable by more than that, any other cause by its largest difference. Differences are the largest within
+WINDOW of the duration around each time: one that crosses 0 proves nothing. The bar is the root of the sum of squares of
+the causes. docs/validation.md has the study.
 """
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from mpmcli.error_bars.observables import DENSITY, QUATERNION, Series
-from mpmcli.error_bars.siblings import Sibling
+from mpmcli.error_bars.siblings import LEVELS, Sibling
 from mpmcli.output.directory import ERROR_BARS
 
 # The file of bars in the directory ERROR_BARS of a result.
@@ -26,7 +27,13 @@ BARS = "error_bars.json"
 WINDOW = 0.05
 # Smallest bar relative to the size of an observable: rounding of f32.
 FLOOR = 1e-5
-# Factors on bars for a coverage of 90 and 95 %; the second if other causes than the grid were varied.
+# Factor on the smaller of the differences of two grids.
+MARGIN = 1.25
+# Share of the size of an observable that another choice of the model moves it by at least, to count.
+MATTERS = 0.01
+# What of a body the scheme conserves; nothing else can be exact.
+CONSERVED = ("velocity", "centre", "spin")
+# Factors on bars for a coverage of 90 and 95 %; the second if other causes than the grid and the model were varied.
 FACTORS = {90: (1.0, 1.0), 95: (1.42, 1.18)}
 # Runs have parted where gravity x (1 + 1e-6) moves this share of the mass on the map.
 PARTED = 0.005
@@ -45,21 +52,19 @@ class Bar:
         bar: (K,), 0 where it has no value.
         causes: parts of the bar by cause, (K,).
         size: what it is compared with: the extent of the material, its energy, its speed, or its own range.
+        exact: whether the scheme conserves it, and all grids agree to rounding at all times.
     """
 
     value: np.ndarray
     bar: np.ndarray
     causes: dict[str, np.ndarray]
     size: float
-
-    def exact(self, k: int) -> bool:
-        """Whether the bar at a time is that of rounding, which a coarser grid alone can show."""
-        return "grid" in self.causes and bool(self.bar[k] <= 1.5 * FLOOR * self.size)
+    exact: bool = False
 
     def text(self, k: int) -> str:
         """Return the value and the bar at a time with one digit of the bar, two below 3, such as "0.83 ± 0.05"."""
         value, bar = float(self.value[k]), float(self.bar[k])
-        if self.exact(k):
+        if self.exact:
             return f"{value:.6g}, exact to rounding"
         if not 1e-4 <= bar < 1e5:
             return f"{value:.3g} ± {bar:.1g}"
@@ -69,7 +74,7 @@ class Bar:
 
     def main_cause(self, k: int) -> str:
         """Return the causes that make a bar, the largest first; none if it is that of rounding."""
-        if self.exact(k):
+        if self.exact:
             return ""
         parts = sorted(((float(part[k]), cause) for cause, part in self.causes.items()), reverse=True)
         return ", ".join(cause for part, cause in parts if part > NAMED * self.bar[k])
@@ -77,13 +82,17 @@ class Bar:
 
 @dataclass(frozen=True)
 class Bars:
-    """The bars of a run at K frames by observable, the map of the mass first; `parted`, s: see PARTED."""
+    """The bars of a run at K frames by observable, the map of the mass first.
+
+    `parted`, s: see PARTED; `depends`: the observables that another choice of the model moves, by that choice.
+    """
 
     time: np.ndarray
     of: dict[str, Bar]
     parted: float | None = None
     confidence: int = 90
     warnings: tuple[str, ...] = field(default=())
+    depends: Mapping[str, list[str]] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
         """Return it for JSON."""
@@ -91,6 +100,7 @@ class Bars:
             "confidence_percent": self.confidence,
             "parted_s": self.parted,
             "warnings": list(self.warnings),
+            "depends_on": dict(self.depends),
             "time_s": self.time.tolist(),
             "observables": {
                 name: {
@@ -116,23 +126,34 @@ def read_bars(directory: Path, times: np.ndarray) -> dict[str, Any] | None:
 
 def bars_of(base: Series, runs: Runs, confidence: int = 90, warnings: Sequence[str] = ()) -> Bars:
     """Return the bars of a run from the series of its siblings, which have the same times."""
-    factor = FACTORS[confidence][any(sibling.cause != "grid" for sibling, _ in runs)]
-    sizes, found = sizes_of(base), {}
+    factor = FACTORS[confidence][any(sibling.cause not in LEVELS["grids"] for sibling, _ in runs)]
+    sizes, found, depends = sizes_of(base), {}, {}
+    coarse = {sibling.ratio: series for sibling, series in runs if sibling.cause == "grid"}
     for name in (DENSITY, *base.values):
-        causes: dict[str, np.ndarray] = {}
+        parts: dict[str, list[np.ndarray]] = {}
         for sibling, series in runs:
-            if name != DENSITY and name not in series.values:
+            # Another choice of the model is compared on the grid that it was computed on.
+            other = coarse.get(sibling.ratio) if sibling.cause == "model" else base
+            if other is None or (name != DENSITY and not (name in series.values and name in other.values)):
                 continue
             # The map has no sign: the share of the mass that is elsewhere takes the place of a difference.
-            gap = distance(series, base) if name == DENSITY else series.values[name] - base.values[name]
-            weight = 1 / (sibling.ratio - 1) if sibling.cause == "grid" else 1.0
-            part = weight * enveloped(gap, base.time)
-            causes[sibling.cause] = np.fmax(causes.get(sibling.cause, 0.0), part)
+            gap = distance(series, other) if name == DENSITY else series.values[name] - other.values[name]
+            part = enveloped(gap, base.time) / (sibling.ratio - 1 if sibling.cause == "grid" else 1.0)
+            if sibling.cause == "model":
+                if not (part > np.fmax(np.max(parts.get("grid", [0.0]), axis=0), MATTERS * sizes[name])).any():
+                    continue
+                depends.setdefault(sibling.name, []).append(name)
+            parts.setdefault(sibling.cause, []).append(part)
+        causes = {cause: np.max(those, axis=0) for cause, those in parts.items()}
+        if "grid" in causes:
+            causes["grid"] = np.fmax(causes["grid"], MARGIN * np.min(parts["grid"], axis=0))
         squares = sum((part**2 for part in causes.values()), np.zeros(len(base.time)))
         value = base.values.get(name, np.zeros(len(base.time)))
         bar = np.sqrt(factor**2 * squares + (FLOOR * sizes[name]) ** 2)
-        found[name] = Bar(value, np.where(np.isfinite(value), bar, 0.0), causes, sizes[name])
-    return Bars(base.time, found, parting(base, runs), confidence, tuple(warnings))
+        conserved = "grid" in causes and any(part in CONSERVED for part in name.split("."))
+        exact = conserved and bool((bar <= 1.5 * FLOOR * sizes[name]).all())
+        found[name] = Bar(value, np.where(np.isfinite(value), bar, 0.0), causes, sizes[name], exact)
+    return Bars(base.time, found, parting(base, runs), confidence, tuple(warnings), depends)
 
 
 def enveloped(difference: np.ndarray, times: np.ndarray) -> np.ndarray:

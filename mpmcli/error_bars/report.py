@@ -17,7 +17,7 @@ from mpmcli.plain_json import finite_json
 from mpmcli.plain_text import counted, duration_text, markdown_table, plain_number, text_table
 from mpmcli.plot.style import LIGHT_SERIES, THEMES, drawing
 from mpmcli.scene import Scene
-from mpmcli.scene.problem import hint_at, listed
+from mpmcli.scene.problem import hint_at, listed, several
 from mpmcli.scene.quantity import AXES
 
 PAGE, BANDS, COST = "report.md", "bands.svg", "cost.svg"
@@ -69,7 +69,7 @@ def rows_of(bars: Bars) -> list[tuple[str, ...]]:
         (
             "mass elsewhere" if name == DENSITY else name,
             f"{known[name].bar[-1]:.2g}" if name == DENSITY else known[name].text(-1),
-            "" if known[name].exact(-1) else f"{100 * known[name].bar[-1] / known[name].size:.2g}",
+            "" if known[name].exact else f"{100 * known[name].bar[-1] / known[name].size:.2g}",
             known[name].main_cause(-1),
         )
         for name in order
@@ -88,6 +88,9 @@ def remarks(study: Study) -> list[str]:
     """Return sentences on the cost, on what was left out, on the time of parting, and on what bars do not contain."""
     found = [f"{counted(len(study.runs), 'sibling')} in {study.cost:.2g} times the time of the run."]
     found += [f"Left out: {one.name}: {one.reason}." for one in study.left_out]
+    for choice, names in study.bars.depends.items():
+        said = several(["mass elsewhere" if name == DENSITY else name for name in names])
+        found.append(f"{said}: depends on a choice that the scene leaves open ({choice}); the bar contains it.")
     if study.bars.parted is not None:
         found.append(
             f"From {study.bars.parted:.3g} s rounding alone parts runs: single runs then differ by what is shown as "
@@ -192,7 +195,7 @@ def write(study: Study, directory: Path) -> None:
 def draw_bands(study: Study) -> bytes:
     """Return a figure of the headline and of the observables with the widest bars over time, as SVG."""
     bars, first = study.bars, headline(study.scene, study.bars)
-    shown = [name for name in bars.of if name not in (DENSITY, first) and not bars.of[name].exact(-1)]
+    shown = [name for name in bars.of if name not in (DENSITY, first) and not bars.of[name].exact]
     shown.sort(key=lambda name: -float(np.nanmax(bars.of[name].bar)) / bars.of[name].size)
     with drawing(SIZE, THEMES["light"]) as figure:
         for axes, name in zip(figure.subplots(3, 2).flat, (first, *shown[: PANELS - 1]), strict=False):

@@ -1,14 +1,15 @@
 """The siblings of a scene: the same physics with one numerical choice changed.
 
-Two coarser grids, half a step, a shifted grid, other samples, and gravity times 1 + 1e-6, which shows from which time
-on rounding alone parts two runs.
+Two coarser grids, other choices of the model on the coarsest of them, half a step, a shifted grid, other samples, and
+gravity times 1 + 1e-6, which shows from which time on rounding alone parts two runs.
 """
 
 import copy
 import math
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
@@ -18,13 +19,13 @@ from mpmcli.scene.domain import FEWEST_CELLS, FEWEST_PERIODIC_CELLS, PASSED, PER
 from mpmcli.scene.quantity import AXES
 
 Tables = dict[str, Any]
-Cause = Literal["grid", "rounding", "step", "placement", "sample"]
+Cause = Literal["grid", "model", "rounding", "step", "placement", "sample"]
 Level = Literal["grids", "step", "all"]
 # The causes of each level, and its cost in runs of the scene in 2D.
 LEVELS: dict[Level, tuple[Cause, ...]] = {
-    "grids": ("grid",),
-    "step": ("grid", "rounding", "step"),
-    "all": ("grid", "rounding", "step", "placement", "sample"),
+    "grids": ("grid", "model"),
+    "step": ("grid", "model", "rounding", "step"),
+    "all": ("grid", "model", "rounding", "step", "placement", "sample"),
 }
 CAUSES = LEVELS["all"]
 # Spacings of the coarser grids over that of the scene; how far a spacing that fits may be from them, how far a wall may
@@ -36,6 +37,8 @@ PREFERRED = (1.4, 1.5)
 NEAR = 2.5
 # Shifts of the grid, cells. Not a half: two particles per axis would meet the nodes in the same way.
 SHIFTS = (0.37, 0.71)
+# Factors on moduli that the scene leaves to mpmcli, and the name of the sample of liquids and grains among choices.
+MODULI, SAMPLING = (0.5, 2.0), "sampling"
 # Factor on gravity. It changes numbers by ten times the rounding of f32.
 NUDGE = 1 + 1e-6
 
@@ -73,10 +76,16 @@ def tables_of(scene: Scene) -> Tables:
     return tomllib.loads(scene_to_toml(scene.model_copy(update={"error_bars": None})))
 
 
-def siblings_of(tables: Tables, reach: Reach, causes: tuple[Cause, ...]) -> Iterator[Sibling | LeftOut]:
-    """Yield the siblings of a scene for some causes, in the order of LEVELS."""
+def siblings_of(
+    tables: Tables,
+    reach: Reach,
+    causes: tuple[Cause, ...],
+    choices: Mapping[str, tuple[str, ...]] = MappingProxyType({}),
+) -> Iterator[Sibling | LeftOut]:
+    """Yield the siblings of a scene for some causes, in the order of LEVELS; `choices`: see `models`."""
     makers: dict[Cause, Callable[[], Iterator[Sibling | LeftOut]]] = {
         "grid": lambda: (coarser(tables, reach, target) for target in RATIOS),
+        "model": lambda: models(tables, reach, choices),
         "rounding": lambda: iter([nudged(tables)]),
         "step": lambda: iter([half_step(tables)]),
         "placement": lambda: (shifted(tables, reach, share) for share in SHIFTS),
@@ -113,6 +122,28 @@ def coarser(tables: Tables, reach: Reach, target: float) -> Sibling | LeftOut:
     domain["spacing"] = new
     ratio = new / old
     return Sibling(f"spacing x {ratio:.3g}", "grid", changed, ratio)
+
+
+def models(tables: Tables, reach: Reach, choices: Mapping[str, tuple[str, ...]]) -> Iterator[Sibling]:
+    """Yield the scene on the coarsest grid with other choices than those that it leaves to mpmcli.
+
+    `choices` has the names of moduli, and SAMPLING, by the body or emitter that they are for.
+    """
+    grids = [one for one in (coarser(tables, reach, target) for target in RATIOS) if isinstance(one, Sibling)]
+    for coarsest in grids[-1:]:
+        for factor in MODULI:
+            changed = copy.deepcopy(coarsest.tables)
+            for source in _sources(changed):
+                for name in set(choices.get(source["name"], ())) - {SAMPLING}:
+                    source["material"][name] *= factor
+            if changed != coarsest.tables:
+                yield Sibling(f"automatic moduli x {factor:g}", "model", changed, coarsest.ratio)
+        changed = copy.deepcopy(coarsest.tables)
+        for source in _sampled(changed):
+            if SAMPLING in choices.get(source["name"], ()) and source["sampling"] == "lattice":
+                turn(source)
+        if changed != coarsest.tables:
+            yield Sibling("turned sample", "model", changed, coarsest.ratio)
 
 
 def fixed_faces(tables: Tables, reach: Reach) -> list[tuple[bool, bool]]:
@@ -201,8 +232,7 @@ def samples(tables: Tables) -> Iterator[Sibling | LeftOut]:
     for source in _sampled(other):
         source["seed"] += 1
         if source["sampling"] == "lattice":
-            # Random positions would measure their own noise, a hundred times that of a lattice.
-            source |= {"sampling": "turned"} | ({"relaxed": True} if "relaxed" in source else {})
+            turn(source)
         elif source["sampling"] == "turned":
             source["sampling"] = "jittered"
     if more == tables:
@@ -212,7 +242,15 @@ def samples(tables: Tables) -> Iterator[Sibling | LeftOut]:
     yield Sibling("other sample", "sample", other)
 
 
+def turn(source: Tables) -> None:
+    """Replace a lattice by a turned one; random positions would measure their own noise, a hundred times as large."""
+    source |= {"sampling": "turned"} | ({"relaxed": True} if "relaxed" in source else {})
+
+
+def _sources(tables: Tables) -> list[Tables]:
+    return [*tables.get("bodies", []), *tables.get("emitters", [])]
+
+
 def _sampled(tables: Tables) -> list[Tables]:
     """Return the bodies and emitters whose particles mpmcli places."""
-    sources = (*tables.get("bodies", []), *tables.get("emitters", []))
-    return [source for source in sources if "points" not in source["shape"]]
+    return [source for source in _sources(tables) if "points" not in source["shape"]]

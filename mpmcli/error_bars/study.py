@@ -15,7 +15,19 @@ from mpmcli.check.geometry import thin_colliders
 from mpmcli.check.shape_rules import STANDOFF
 from mpmcli.error_bars.bars import Bars, bars_of
 from mpmcli.error_bars.observables import Map, Observer, Series
-from mpmcli.error_bars.siblings import CAUSES, LEVELS, Cause, LeftOut, Level, Reach, Sibling, siblings_of, tables_of
+from mpmcli.error_bars.siblings import (
+    CAUSES,
+    LEVELS,
+    MODULI,
+    SAMPLING,
+    Cause,
+    LeftOut,
+    Level,
+    Reach,
+    Sibling,
+    siblings_of,
+    tables_of,
+)
 from mpmcli.errors import InputError, MpmcliError, RunError
 from mpmcli.materials.registry import laws as known_laws
 from mpmcli.materials.registry import parameter_models
@@ -97,6 +109,7 @@ class StudyPlan:
     def cost(self, dimension: int) -> float:
         """Return the forecast of the time of the siblings in runs of the scene."""
         costs = {"grid": sum(r ** -(dimension + 1) for r in (2**0.5, 2.0)), "rounding": 1.0, "step": 2.0}
+        costs["model"] = (1 + sum(factor**0.5 for factor in MODULI)) * 2.0 ** -(dimension + 1)
         costs |= {"placement": 2.0, "sample": 1 + 1.5**dimension}
         return sum(costs[cause] for cause in self.causes)
 
@@ -104,7 +117,8 @@ class StudyPlan:
 def chosen_causes(level: Level, only: Sequence[str] = (), skip: Sequence[str] = ()) -> tuple[Cause, ...]:
     """Return the causes of a level, or those named, without others; InputError: none is left."""
     causes = tuple(cause for cause in (only or LEVELS[level]) if cause not in skip)
-    if not causes:
+    # Other choices of the model are compared on the coarsest grid.
+    if causes in ((), ("model",)):
         raise InputError("--skip leaves nothing to compute: give fewer, or another --level.")
     return tuple(cause for cause in CAUSES if cause in causes)
 
@@ -112,8 +126,15 @@ def chosen_causes(level: Level, only: Sequence[str] = (), skip: Sequence[str] = 
 class Student:
     """Computes the runs of one study in this process, with kernels that are shared."""
 
-    def __init__(self, loaded: LoadedScene, plan: StudyPlan) -> None:
+    def __init__(self, loaded: LoadedScene, plan: StudyPlan, chosen: Sequence[Sequence[str]] | None = None) -> None:
+        """`chosen`: the automatic parameters of each body and emitter; by default those that the scene leaves out."""
         self.plan, self.scene = plan, loaded.scene
+        materials = [source.material for source in loaded.scene.sources]
+        chosen = chosen or [[*({*type(one).model_fields} - one.model_fields_set)] for one in materials]
+        self.choices = {
+            source.name: (*(n for n in names if n.endswith("_modulus")), *([] if source.has_surface else [SAMPLING]))
+            for source, names in zip(loaded.scene.sources, chosen, strict=True)
+        }
         self._folder = Path(loaded.source).parent
         self.tables = tables_of(loaded.scene)
         self.map = Map.of(loaded.scene)
@@ -148,7 +169,7 @@ class Student:
         """
         study = Study(self.scene, base, confidence=self.plan.confidence)
         wanted: list[tuple[Sibling, Scene]] = []
-        for one in siblings_of(self.tables, base.reach, self.plan.causes):
+        for one in siblings_of(self.tables, base.reach, self.plan.causes, self.choices):
             try:
                 wanted += [(one, self._scene_of(one.tables))] if isinstance(one, Sibling) else []
                 study.left_out += [one] if isinstance(one, LeftOut) else []
