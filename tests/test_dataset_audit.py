@@ -296,10 +296,16 @@ def test_the_other_layout_of_gns_is_read(sound: Path, tmp_path: Path, tuples: bo
     assert found.findings == 0 and len(found.seen) == len(SPLITS)
 
 
-@pytest.mark.parametrize("form", ["zarr", "tfrecord"])
-def test_formats_of_other_packages_are_read(sound: Path, tmp_path: Path, form: str) -> None:
-    pytest.importorskip(form)
+OTHERS = {"zarr": "zarr", "tfrecord": "tfrecord", "parquet": "pyarrow", "usd": "pxr"} | dict.fromkeys(
+    ("vtkhdf", "vtk", "ply"), "meshio"
+)
+
+
+@pytest.mark.parametrize("form", OTHERS)
+def test_all_other_formats_are_read(sound: Path, tmp_path: Path, form: str) -> None:
+    pytest.importorskip(OTHERS[form])
     assert run_here("export", sound / "set", "--to", form, "-o", tmp_path / form).status == 0
     found = audit(tmp_path / form)
     assert found.findings == 0 and len(found.seen) == len(SPLITS)
-    assert found.rules["gravity"]["applied"] == len(SPLITS)
+    assert found.rules["gravity"]["applied"] == found.rules["dt"]["applied"] == len(SPLITS)
+    assert found.rules["types"]["verdict"] == "ok" or form == "tfrecord"

@@ -5,29 +5,20 @@ mean of n of them one of 2 eps / sqrt(n). Frames lie `dt` apart to within a step
 differences depend by less than a thousandth.
 """
 
-import io
-import json
-import pickle
-import re
-import struct
-import tarfile
 import warnings
-import zipfile
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import combinations
+from itertools import combinations, starmap
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 
+from mpmcli.dataset.exported import trajectories
 from mpmcli.dataset.metadata import EXPORTED_BY, STD_LEAST
-from mpmcli.dataset.shard import SPLITS, group_name
-from mpmcli.errors import InputError
-from mpmcli.extras import imported
+from mpmcli.dataset.shard import SPLITS
 from mpmcli.frames.frame import ACTIVE
 from mpmcli.output.header import nearest_image
 from mpmcli.plain_text import counted
@@ -37,8 +28,6 @@ from mpmcli.plain_text import counted
 MOST, WINDOW, WINDOWS, CELLS = 5, 5, 32, 10**7
 # Names of the types of particles on walls in metadata.json; and their numbers for GNS and LagrangeBench without it.
 WALLS, USUAL_WALLS = ("wall", "moving_wall", "rigid_body"), {"gns": (3,), "lagrangebench": (1, 2, 3)}
-FILES = {r"_\.(npz|tfrecord)": "gns", r"_\.h5": "lagrangebench", "_": "neuralmpm", r"_-.*\.tar": "webdataset"}
-FILES |= {r"trajectories\.zarr": "zarr", r"\d{6,}\.npz": "npz"}
 # Frame and value, None if there is none, and a sentence.
 Findings = Iterator[tuple[int | None, float | None, str]]
 
@@ -429,7 +418,7 @@ def audit(directory: Path) -> Audit:
     found = Audit(directory)
     with np.errstate(all="ignore"), warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
-        for one in trajectories(directory):
+        for one in starmap(Exported, trajectories(directory)):
             own = (one.finite, one.counts, one.types, one.bounds, one.units, one.precision, one.frames, one.jumps)
             for rule in (*own, one.dt, one.gravity, one.momentum, one.walls):
                 found.judge(rule, one.name)
@@ -438,87 +427,3 @@ def audit(directory: Path) -> Audit:
         for each in (found.statistics, found.splits, found.duplicates, found.leakage):
             found.judge(each)
     return found
-
-
-class _Arrays(pickle.Unpickler):
-    def find_class(self, module: str, name: str) -> Any:
-        """Return what makes an array; UnpicklingError: anything else, as files of others are data and never run."""
-        if module.split(".")[0] == "numpy" and name in ("_reconstruct", "ndarray", "dtype", "scalar", "_frombuffer"):
-            return super().find_class(module, name)
-        raise pickle.UnpicklingError(f"it names {module}.{name}, which is no array")
-
-
-def _read(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield the name and the arrays of each trajectory in a file or a store."""
-    if path.suffix == ".npz" and path.stem in SPLITS:
-        with zipfile.ZipFile(path) as archive:
-            for name in archive.namelist():
-                with archive.open(name) as file:
-                    np.lib.format.read_magic(file)
-                    np.lib.format.read_array_header_1_0(file)
-                    entries = _Arrays(file).load()
-                # One trajectory under its name, or all under gns_data.
-                for k, entry in enumerate([entries] if getattr(entries[0], "ndim", 1) == 3 else entries):
-                    kind = np.resize(entry[1], entry[0].shape[1] if np.ndim(entry[1]) == 0 else len(entry[1]))
-                    yield name.removesuffix(".npy") + f"[{k}]" * (k > 0), {"position": entry[0], "kind": kind}
-    elif path.suffix == ".npz":
-        with np.load(path, allow_pickle=False) as file:
-            yield path.stem, dict(file)
-    elif path.suffix == ".h5":
-        with h5py.File(path) as file:
-            for name in file:
-                yield name, {"position": file[name]["position"][:], "kind": file[name]["particle_type"][:]}
-    elif path.suffix == ".tar":
-        with tarfile.open(path) as archive:
-            for member in archive:
-                if member.name.endswith(".npz") and (content := archive.extractfile(member)):
-                    with np.load(io.BytesIO(content.read()), allow_pickle=False) as file:
-                        yield member.name.removesuffix(".npz"), dict(file)
-    elif path.suffix == ".zarr":
-        for name, group in sorted(imported("zarr", "zarr", "dataset audit").open_group(path, mode="r").groups()):
-            yield name, {key: array[...] for key, array in group.arrays()}
-    elif path.suffix == ".tfrecord":
-        types = imported("tfrecord.example_pb2", "tfrecord", "dataset audit")
-        with path.open("rb") as file:
-            while head := file.read(12):
-                example = types.SequenceExample.FromString(file.read(struct.unpack("<Q", head[:8])[0]))
-                file.seek(4, io.SEEK_CUR)
-                kind = np.frombuffer(example.context.feature["particle_type"].bytes_list.value[0], np.int64)
-                frames = [f.bytes_list.value[0] for f in example.feature_lists.feature_list["position"].feature]
-                x = np.frombuffer(b"".join(frames), np.float32).reshape(len(frames), len(kind), -1)
-                yield str(example.context.feature["key"].int64_list.value[0]), {"position": x, "kind": kind}
-    else:
-        for sim in sorted(path.glob("sim_*.h5"), key=lambda p: int(p.stem[4:])):
-            with h5py.File(sim) as file:
-                known = {key: file[key][:] for key in ("boundary", "grav") if key in file}
-                yield sim.stem, known | {"position": file["particles"][:], "kind": file["types"][:]}
-
-
-def trajectories(directory: Path) -> Iterator[Exported]:
-    """Yield the trajectories of an export, one at a time; InputError: it is none, or a file cannot be read."""
-    path, form = directory / "metadata.json", "JSON"
-    try:
-        meta = json.loads(path.read_text(encoding="utf-8"))
-        meta |= meta.get("train", {})
-        numbers, count = meta.get("trajectories") or {}, Counter[str]()
-        files = {path: form for names, form in FILES.items() for path in sorted(directory.iterdir())
-                 if re.fullmatch(names.replace("_", "(train|valid|test)"), path.name)}  # fmt: skip
-        for path, form in files.items():
-            for name, arrays in _read(path):
-                split = re.split(r"\W", path.name)[0]
-                if form in ("npz", "zarr", "webdataset"):
-                    number = int(name)
-                    split = next((each for each in SPLITS if number in numbers.get(each, ())), "train")
-                else:
-                    number = dict(enumerate(numbers.get(split, ()))).get(count[split], -1)
-                count[split] += 1
-                group, d = group_name(number), arrays["position"].shape[2]
-                own = {key: facts[group] for key, facts in meta.items() if isinstance(facts, dict) and group in facts}
-                if arrays["position"].dtype.kind != "f" or (meta.get("bounds") and np.shape(meta["bounds"]) != (d, 2)):
-                    raise ValueError(f"{name} has no positions as floats, or bounds are not a pair per component")
-                yield Exported(f"{path.name}/{name}", split, form, arrays, meta, own)
-    except (ArithmeticError, AttributeError, EOFError, LookupError, OSError, pickle.PickleError, TypeError, ValueError,
-            tarfile.TarError, zipfile.BadZipFile) as error:  # fmt: skip
-        raise InputError(f"{path} cannot be read as {form} of an export ({error}).") from error
-    if not files:
-        raise InputError(f"{directory} holds no trajectories of tfrecord, {', '.join(FILES.values())}.")
