@@ -31,8 +31,6 @@ FLOOR = 1e-5
 MARGIN = 1.25
 # Share of the size of an observable that another choice of the model moves it by at least, to count.
 MATTERS = 0.01
-# What of a body the scheme conserves; nothing else can be exact.
-CONSERVED = ("velocity", "centre", "spin")
 # Factors on bars for a coverage of 90 and 95 %; the second if other causes than the grid and the model were varied.
 FACTORS = {90: (1.0, 1.0), 95: (1.42, 1.18)}
 # Runs have parted where gravity x (1 + 1e-6) moves this share of the mass on the map.
@@ -48,34 +46,29 @@ class Bar:
     """One observable over time.
 
     Attributes:
-        value: (K,) of the run; 0 for the map of the mass, whose bar is the share of the mass that is elsewhere.
+        value: (K,) of the run, NaN where it or all siblings have none; 0 for the map of the mass, whose bar is the
+            share of the mass that is elsewhere.
         bar: (K,), 0 where it has no value.
         causes: parts of the bar by cause, (K,).
         size: what it is compared with: the extent of the material, its energy, its speed, or its own range.
-        exact: whether the scheme conserves it, and all grids agree to rounding at all times.
     """
 
     value: np.ndarray
     bar: np.ndarray
     causes: dict[str, np.ndarray]
     size: float
-    exact: bool = False
 
     def text(self, k: int) -> str:
         """Return the value and the bar at a time with one digit of the bar, two below 3, such as "0.83 ± 0.05"."""
         value, bar = float(self.value[k]), float(self.bar[k])
-        if self.exact:
-            return f"{value:.6g}, exact to rounding"
-        if not 1e-4 <= bar < 1e5:
+        if not 1e-7 <= bar < 1e5:
             return f"{value:.3g} ± {bar:.1g}"
         leading, power = f"{bar:.0e}".split("e")
         digits = max(0, (leading < "3") - int(power))
         return f"{value + 0.0:.{digits}f} ± {bar:.{digits}f}"
 
     def main_cause(self, k: int) -> str:
-        """Return the causes that make a bar, the largest first; none if it is that of rounding."""
-        if self.exact:
-            return ""
+        """Return the causes that make a bar, the largest first; none if it is the FLOOR."""
         parts = sorted(((float(part[k]), cause) for cause, part in self.causes.items()), reverse=True)
         return ", ".join(cause for part, cause in parts if part > NAMED * self.bar[k])
 
@@ -130,7 +123,9 @@ def bars_of(base: Series, runs: Runs, confidence: int = 90, warnings: Sequence[s
     sizes, found, depends = sizes_of(base), {}, {}
     coarse = {sibling.ratio: series for sibling, series in runs if sibling.cause == "grid"}
     for name in (DENSITY, *base.values):
+        value = base.values.get(name, np.zeros(len(base.time)))
         parts: dict[str, list[np.ndarray]] = {}
+        known = np.zeros(len(base.time), bool)
         for sibling, series in runs:
             # Another choice of the model is compared on the grid that it was computed on.
             other = coarse.get(sibling.ratio) if sibling.cause == "model" else base
@@ -138,21 +133,21 @@ def bars_of(base: Series, runs: Runs, confidence: int = 90, warnings: Sequence[s
                 continue
             # The map has no sign: the share of the mass that is elsewhere takes the place of a difference.
             gap = distance(series, other) if name == DENSITY else series.values[name] - other.values[name]
+            known |= np.isfinite(value) & np.isfinite(gap)
             part = enveloped(gap, base.time) / (sibling.ratio - 1 if sibling.cause == "grid" else 1.0)
             if sibling.cause == "model":
                 if not (part > np.fmax(np.max(parts.get("grid", [0.0]), axis=0), MATTERS * sizes[name])).any():
                     continue
                 depends.setdefault(sibling.name, []).append(name)
             parts.setdefault(sibling.cause, []).append(part)
+        if not known.any():
+            continue
         causes = {cause: np.max(those, axis=0) for cause, those in parts.items()}
         if "grid" in causes:
             causes["grid"] = np.fmax(causes["grid"], MARGIN * np.min(parts["grid"], axis=0))
         squares = sum((part**2 for part in causes.values()), np.zeros(len(base.time)))
-        value = base.values.get(name, np.zeros(len(base.time)))
         bar = np.sqrt(factor**2 * squares + (FLOOR * sizes[name]) ** 2)
-        conserved = "grid" in causes and any(part in CONSERVED for part in name.split("."))
-        exact = conserved and bool((bar <= 1.5 * FLOOR * sizes[name]).all())
-        found[name] = Bar(value, np.where(np.isfinite(value), bar, 0.0), causes, sizes[name], exact)
+        found[name] = Bar(np.where(known, value, np.nan), np.where(known, bar, 0.0), causes, sizes[name])
     return Bars(base.time, found, parting(base, runs), confidence, tuple(warnings), depends)
 
 

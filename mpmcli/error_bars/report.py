@@ -57,7 +57,7 @@ def last_line(study: Study) -> str:
     body, _, kind = body.rpartition(".")
     said = f"front of {body}" if kind in ("low", "high") else f"{kind} of {body}, {what}," if body else name
     value, _, bar = bars.of[name].text(-1).partition(" ± ")
-    shown = f"{value}{unit_of(name)} ± {bar}" if bar else value
+    shown = f"{value}{unit_of(name)} ± {bar}"
     return f"{said} at {bars.time[-1]:.4g} s: {shown}"
 
 
@@ -69,7 +69,7 @@ def rows_of(bars: Bars) -> list[tuple[str, ...]]:
         (
             "mass elsewhere" if name == DENSITY else name,
             f"{known[name].bar[-1]:.2g}" if name == DENSITY else known[name].text(-1),
-            "" if known[name].exact else f"{100 * known[name].bar[-1] / known[name].size:.2g}",
+            f"{100 * known[name].bar[-1] / known[name].size:.2g}",
             known[name].main_cause(-1),
         )
         for name in order
@@ -195,7 +195,7 @@ def write(study: Study, directory: Path) -> None:
 def draw_bands(study: Study) -> bytes:
     """Return a figure of the headline and of the observables with the widest bars over time, as SVG."""
     bars, first = study.bars, headline(study.scene, study.bars)
-    shown = [name for name in bars.of if name not in (DENSITY, first) and not bars.of[name].exact]
+    shown = [name for name in bars.of if name not in (DENSITY, first)]
     shown.sort(key=lambda name: -float(np.nanmax(bars.of[name].bar)) / bars.of[name].size)
     with drawing(SIZE, THEMES["light"]) as figure:
         for axes, name in zip(figure.subplots(3, 2).flat, (first, *shown[: PANELS - 1]), strict=False):
