@@ -222,7 +222,7 @@ def test_the_other_siblings_change_one_thing() -> None:
     assert models["turned sample"]["bodies"][0]["sampling"] == "turned"
     for name, changed in models.items():
         assert changed["domain"] == coarsest["domain"]
-        factor = {"automatic moduli x 0.5": 0.5, "automatic moduli x 2": 2.0, "turned sample": 1.0}[name]
+        factor = {"automatic moduli x 0.5": 0.5, "turned sample": 1.0}[name]
         modulus = changed["bodies"][0]["material"]["bulk_modulus"]
         assert modulus == factor * tables["bodies"][0]["material"]["bulk_modulus"]
     for changed in (*found.values(), *models.values()):
@@ -413,4 +413,4 @@ def test_levels_name_their_causes() -> None:
     assert chosen_causes("grids", only=("step", "grid"), skip=("grid",)) == ("step",)
     grids = StudyPlan(("grid",))
     assert grids.cost(2) == pytest.approx(0.48, abs=0.01) and grids.cost(3) == pytest.approx(0.31, abs=0.01)
-    assert StudyPlan().cost(2) < 0.9
+    assert StudyPlan().cost(2) < 0.7

@@ -22,7 +22,7 @@ BAR_OPTIONS = ("bar_level", "budget", "only", "skip", "confidence", "observe", "
 
 def bar_options(command: Callable) -> Callable:
     """Add the options of error bars to a command."""
-    level = "Siblings: grids are coarser ones, 0.9 runs; step adds half a step, 4; all placement and samples, 9."
+    level = "Siblings: grids are coarser ones, 0.7 runs; step adds half a step, 3.7; all placement and samples, 9."
     mean = "Also the mean over the particles of an expression of x, y, z, vx, vy, vz and t. May be repeated."
     for option in (
         click.option(

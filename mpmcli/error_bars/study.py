@@ -18,8 +18,8 @@ from mpmcli.error_bars.observables import Map, Observer, Series
 from mpmcli.error_bars.siblings import (
     CAUSES,
     LEVELS,
-    MODULI,
     SAMPLING,
+    SOFTER,
     Cause,
     LeftOut,
     Level,
@@ -109,7 +109,7 @@ class StudyPlan:
     def cost(self, dimension: int) -> float:
         """Return the forecast of the time of the siblings in runs of the scene."""
         costs = {"grid": sum(r ** -(dimension + 1) for r in (2**0.5, 2.0)), "rounding": 1.0, "step": 2.0}
-        costs["model"] = (1 + sum(factor**0.5 for factor in MODULI)) * 2.0 ** -(dimension + 1)
+        costs["model"] = (1 + SOFTER**0.5) * 2.0 ** -(dimension + 1)
         costs |= {"placement": 2.0, "sample": 1 + 1.5**dimension}
         return sum(costs[cause] for cause in self.causes)
 
