@@ -90,7 +90,9 @@ def remarks(study: Study) -> list[str]:
     found += [f"Left out: {one.name}: {one.reason}." for one in study.left_out]
     for choice, names in study.bars.depends.items():
         said = several(["mass elsewhere" if name == DENSITY else name for name in names])
-        found.append(f"Within their bars, observables depend on a choice that the scene leaves open ({choice}): {said}.")
+        found.append(
+            f"Within their bars, observables depend on a choice that the scene leaves open ({choice}): {said}."
+        )
     if study.bars.parted is not None:
         found.append(
             f"From {study.bars.parted:.3g} s rounding alone parts runs: single runs then differ by what is shown as "
