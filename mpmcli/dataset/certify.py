@@ -123,11 +123,13 @@ def certify(scene: Scene, folder: Path, laws: Laws, shard: Path, number: int, ru
             gaps[one.cause] = gap / (one.ratio - 1) if one.cause == "grid" else gap
     ways = {"moved": nearest_image(x - x[0], header.period), **gaps}
     of_law = {law.name: own for k, law in enumerate(header.laws) if (own := frames[0].material == k).any()}
-    if len(of_law) > 1:
-        ways |= {f"{name}, {law}": way[:, own] for name, way in ways.items() for law, own in of_law.items()}
+    if len(of_law) > 1 and "grid" in gaps:
+        ways |= {f"grid, {law}": gaps["grid"][:, own] for law, own in of_law.items()}
     bars, relative = bars_of(base, runs), {}
     for name, bar in bars.of.items() if runs else ():
-        relative.setdefault(_kind(name), []).append((bar.bar / bar.size).tolist())
+        # Beyond all of the mass first order says nothing.
+        share = np.minimum(bar.bar / bar.size, 1.0 if name == DENSITY else np.inf)
+        relative.setdefault(_kind(name), []).append(share.tolist())
     measured = {
         "time_s": base.time.tolist(),
         "position_m": {"cell": [h] * len(x), **{name: rms(way).tolist() for name, way in ways.items()}},
@@ -232,8 +234,8 @@ def _kind(name: str) -> str:
 def error_of(directory: Path) -> dict[str, Any] | None:
     """Return the errors over the certified trajectories of a dataset, for JSON; None if there are none.
 
-    Lists over frames are roots of mean squares over trajectories. position_m: "grid", "rounding", also by law; the way
-    "moved" from the start, and the "cell". observables: bars over the size of what they are of, by kind; "density":
+    Lists over frames are roots of mean squares over trajectories. position_m: "grid", also by law, and "rounding"; the
+    way "moved" from the start, and the "cell". observables: bars over the size of what they are of, by kind; "density":
     share of the mass that is elsewhere. one_step: by stride, error of accelerations along each axis over `acc_std`.
     parted_s: of each trajectory, from when rounding alone parts two runs, None if never.
     """
