@@ -12,6 +12,7 @@ from good_sweep import BASE, SWEEP, sweep_of
 from made_dataset import made_trajectory
 
 from mpmcli.dataset import sweep_run
+from mpmcli.dataset.certify import write_certificate
 from mpmcli.dataset.compute import Task
 from mpmcli.dataset.draw import draw
 from mpmcli.dataset.folder import Row, program
@@ -65,6 +66,17 @@ def made_row(task: Task, number: int) -> Row:
     )
 
 
+def made_certificate(number: int) -> dict:
+    """Return errors that grow as the square of the time."""
+    time = [0.01 * k for k in range(11)]
+    places = {
+        name: [size * t**2 for t in time] for name, size in (("moved", 1.0), ("grid", 0.1 + number), ("rounding", 1e-5))
+    }
+    measured = {"time_s": time, "position_m": {"cell": [0.05] * 11, **places}, "observables": {"density": time}}
+    measured["one_step"] = {"1": {"error": [0.003, 0.004], "std": [0.01, 0.01]}}
+    return {"number": number, "left_out": [], "parted_s": None, "measured": measured}
+
+
 class MadeWorkers:
     """In place of the workers of a cluster."""
 
@@ -74,7 +86,9 @@ class MadeWorkers:
         for task in tasks:
             if stop():
                 raise KeyboardInterrupt
-            yield task, [made_row(task, number) for number in task.numbers]
+            if task.certified:
+                write_certificate(task.directory, made_certificate(task.certified.number))
+            yield task, [task.certified] if task.certified else [made_row(task, number) for number in task.numbers]
 
 
 @pytest.fixture

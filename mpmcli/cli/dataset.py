@@ -83,6 +83,7 @@ def sweep_command(
 
         def show(state: SweepState) -> None:
             text, more = f"{state.done - state.accepted} left out", ""
+            text += f", {state.certified} certified" * bool(state.certified)
             if state.steady:
                 text += f", {state.per_hour:,.0f} per hour"
                 more = f", {duration_text((state.expected - state.done) / state.per_hour * 3600)} left"

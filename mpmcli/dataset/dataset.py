@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mpmcli.dataset.folder import MANIFEST
+from mpmcli.dataset.folder import MANIFEST, Manifest
 from mpmcli.dataset.report import MOST_NAMED, status_of
 from mpmcli.dataset.shard import LABELS, MOVING, SHARDS, SPLITS, SWEEP, TABLES, StoredGroup, moving_names, open_shard
 from mpmcli.errors import InputError
@@ -258,6 +258,11 @@ class Dataset:
         named = ", ".join(map(str, self.missing[:MOST_NAMED])) + ", ..." * (len(self.missing) > MOST_NAMED)
         count = counted(len(self.missing), "trajectory")
         return f"{self.path} lacks {count} of its sweep ({named}): mpmcli sweep --resume computes them."
+
+    @cached_property
+    def error(self) -> dict[str, Any] | None:
+        """How wrong the simulator is, see `certify.error_of`; None without [certify] in the sweep."""
+        return Manifest(self.path).facts().get("error") if (self.path / MANIFEST).exists() else None
 
     def __len__(self) -> int:
         return len(self.numbers)

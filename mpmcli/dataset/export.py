@@ -109,6 +109,7 @@ def export(
         if lacks := lacks or "frame" * (each.frame_count == 0):
             raise InputError(f"trajectory {each.source.number} of {dataset.path} has no {lacks} to export.")
     metadata = common_facts(chosen, settings.stride)
+    metadata |= {"error": dataset.error} if dataset.error else {}
     lack = ""
     if settings.trajectory is None and (dataset.path / MANIFEST).exists():
         status = status_of(dataset.path)

@@ -21,6 +21,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
 from mpmcli import __version__
 from mpmcli.check.finding import Verdict
+from mpmcli.dataset.certify import CERTIFICATES
 from mpmcli.dataset.shard import BASE, PENDING, QUARANTINE, SHARDS, SWEEP, checksum, group_name, join_trajectories
 from mpmcli.dataset.sweep import Sweep
 from mpmcli.errors import InputError, RunError
@@ -123,6 +124,11 @@ class Manifest:
             facts = {name: json.loads(value) for name, value in connection.execute("SELECT name, value FROM sweep")}
             require_format(self.path, facts.get("format"), FORMAT)
             return _SweepFacts.model_validate(facts).model_dump()
+
+    def tell(self, name: str, value: Any) -> None:
+        """Add a fact about the sweep, or replace it."""
+        with self._open("write", self.path) as connection:
+            connection.execute("INSERT OR REPLACE INTO sweep VALUES (?, ?)", (name, json.dumps(value, sort_keys=True)))
 
     def rows(self) -> list[Row]:
         """Return all rows, by number."""
@@ -241,7 +247,7 @@ class Folder:
 
 FILE, PLUGIN = "file", "--plugin"
 # Names in a dataset that copied files cannot have.
-OWN = {SWEEP, BASE, SHARDS, PENDING, QUARANTINE}
+OWN = {SWEEP, BASE, SHARDS, PENDING, QUARANTINE, CERTIFICATES}
 
 
 def source_files(sweep: Sweep, plugins: Sequence[Path]) -> dict[str, Path]:

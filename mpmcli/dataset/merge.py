@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from mpmcli.dataset.certify import CERTIFICATES
 from mpmcli.dataset.folder import (
     PROGRAM,
     Manifest,
@@ -49,8 +50,8 @@ def merge(parts: Sequence[Path], target: Path) -> Status:
     files = [
         file
         for part in parts
-        for folder in (SHARDS, QUARANTINE)
-        for file in sorted((part / folder).glob("*.h5"))
+        for folder, ending in ((SHARDS, "h5"), (QUARANTINE, "h5"), (CERTIFICATES, "json"))
+        for file in sorted((part / folder).glob(f"*.{ending}"))
         if not (target / folder / file.name).exists()
     ]
     if manifest.path.exists() and not files and (target / CARD).exists():
@@ -83,5 +84,7 @@ def _require_target(manifest: Manifest, facts: dict[str, Any], rows: Sequence[Ro
     target = manifest.path.parent
     if not manifest.path.exists() and not is_beginning(target):
         require_empty(target, locked=locked)
-    elif manifest.path.exists() and not (manifest.facts() == facts and {*manifest.rows()} <= {*rows}):
+    elif manifest.path.exists() and not (
+        {**manifest.facts(), **facts} == manifest.facts() and {*manifest.rows()} <= {*rows}
+    ):
         raise InputError(f"{target} holds another dataset: give another directory with -o.")

@@ -19,6 +19,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from mpmcli.dataset.certify import FIGURE, TITLE, certificates, error_of, error_section
 from mpmcli.dataset.folder import VERDICTS, Folder, Manifest, Row
 from mpmcli.dataset.shard import (
     BASE,
@@ -157,6 +158,10 @@ def verify(path: Path, on_file: Callable[[int, int], None] = lambda done, total:
     for done, (name, rows) in enumerate(sorted(by_file.items()), 1):
         faults += _faults_of(path / name, rows)
         on_file(done, len(by_file))
+    certified, damaged = certificates(path)
+    wanted = {*Manifest(path).facts().get("certify", {}).get("numbers", ())} - certified.keys()
+    lacking = [row.number for row in status.rows if row.accepted and row.number in wanted]
+    faults += [*damaged, *(f"trajectory {n} has no certificate; mpmcli sweep --resume computes it." for n in lacking)]
     return Verification(path, sum(len(rows) for rows in by_file.values()), tuple(faults))
 
 
@@ -242,6 +247,9 @@ def write_card(directory: Path) -> Path:
     sweep = tomllib.loads(sweep_text)
     base = tomllib.loads((directory / BASE).read_text(encoding="utf-8"))
     included = [row for row in rows if row.accepted]
+    error, plan = error_of(directory), facts.get("certify")
+    if error != facts.get("error"):
+        manifest.tell("error", error)
     tables, loading = split_tables(included), ""
     if included:
         one, d = included[0], len(base["domain"]["size"])
@@ -254,6 +262,7 @@ def write_card(directory: Path) -> Path:
         _counts(facts["count"], rows),
         _left_out([row for row in rows if not row.accepted]),
         _drawn(sweep, rows),
+        error_section(directory, facts["count"], plan, error) if plan else "",
         loading,
         f"Drawn with seed {facts['seed']}; computed with mpmcli {facts['version']}. `sweep.toml` and `base.toml` are "
         "the sweep and its base scene.",
@@ -287,6 +296,8 @@ def remove_card(directory: Path) -> None:
         path.unlink()
     if digest_of(directory / MONTAGE):
         (directory / MONTAGE).unlink()
+    if (directory / FIGURE).is_file() and TITLE.encode() in (directory / FIGURE).read_bytes():
+        (directory / FIGURE).unlink()
 
 
 def table_name(split: str) -> str:

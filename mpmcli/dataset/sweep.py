@@ -342,6 +342,14 @@ class Split(Table):
         return self
 
 
+class Certify(Table):
+    """Which trajectories are computed again, to measure their errors."""
+
+    fraction: Annotated[
+        float, Field(strict=True, gt=0, le=1, description="Fraction of the trajectories, above 0, up to 1.")
+    ] = 0.02
+
+
 class SweepTable(Table):
     """The keys of a sweep file."""
 
@@ -355,6 +363,9 @@ class SweepTable(Table):
     split: Annotated[Split, Field(description="Fractions of the trajectories by their purpose.")] = Split(
         train=0.8, valid=0.1, test=0.1
     )
+    certify: Annotated[Certify | None, Field(description="Trajectories whose errors are measured. Default: none.")] = (
+        None
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -364,7 +375,7 @@ class Sweep:
     Attributes:
         path, text, data: the sweep file, its text, and its parsed TOML; base, base_text, base_data: the same of the
             base scene.
-        count, seed, method, accept, split: as in the file; count may be replaced.
+        count, seed, method, accept, split, certify: as in the file; count may be replaced.
         vary: distributions by key of the base scene, in the order of the file.
         placements: bodies and colliders placed at random.
     """
@@ -382,11 +393,13 @@ class Sweep:
     vary: dict[str, Distribution]
     placements: tuple[Placement, ...]
     split: Split
+    certify: Certify | None
 
     @cached_property
     def key(self) -> str:
         """SHA-256, hexadecimal, of the base scene, the sweep and the count, independent of the layout of the files.
 
+        [certify] does not matter, as trajectories do not depend on it.
         The order of keys in [vary] and of [[place]] matters, because grids and Sobol components follow it.
         """
         vary, place = self.data.get("vary", {}), self.data.get("place", [])

@@ -51,7 +51,7 @@ def load_sweep(
         raise InputError(report(problems, str(path), text)) from None
     parse_scene(base_data, laws=laws, source=str(base), text=base_text, directory=base.parent)
     base_text = base_text or tomli_w.dumps(base_data)
-    same = {name: getattr(table, name) for name in ("count", "seed", "method", "accept", "vary", "split")}
+    same = {name: getattr(table, name) for name in ("count", "seed", "method", "accept", "vary", "split", "certify")}
     sweep = Sweep(File(path), text, data, base, base_text, base_data, placements=table.place, **same)
     problems = list(_misplaced(sweep))
     if not problems:

@@ -15,6 +15,7 @@ import numpy as np
 from mpmcli.check.facts import SceneFacts
 from mpmcli.check.forecast import expected_steps, layout_of, seconds_of_one
 from mpmcli.cores import available_cores
+from mpmcli.dataset.certify import CERTIFICATES, NAMES, certificates, certify_plan, cost_of_one, plan_text
 from mpmcli.dataset.compute import Task, Workers, joined_workers, local_workers, scene_fault
 from mpmcli.dataset.draw import draw
 from mpmcli.dataset.folder import (
@@ -108,6 +109,7 @@ class SweepState:
     seconds: float = 0.0
     start_seconds: float = 0.0
     settled: tuple[int, float] | None = None
+    certified: int = 0
     status: str = "running"
 
     @property
@@ -137,7 +139,7 @@ class SweepState:
             "status": self.status,
             "directory": str(self.directory),
             "trajectories": self.expected,
-            **{name: getattr(self, name) for name in ("done", "kept", "accepted")},
+            **{name: getattr(self, name) for name in ("done", "kept", "accepted", "certified")},
             "verdicts": {verdict: self.verdicts[verdict] for verdict in VERDICTS},
             **{name: getattr(self, name) for name in ("per_hour", "seconds", "start_seconds", "particle_steps")},
         }
@@ -182,6 +184,9 @@ def open_folder(
                 "as it was, or give another directory with -o."
             )
         require_same_program(directory, facts, manifest.rows(), {**program(), "arch": settings.arch})
+        if sweep.certify:
+            write_text(directory / SWEEP, standing_alone(sweep))
+            manifest.tell("certify", certify_plan(sweep))
         return Folder(directory, sweep.count, facts["per_shard"], settings.part), manifest
     replaces = settings.overwrite and directory.is_dir() and any(path.name != LOCK for path in directory.iterdir())
     if replaces and not (directory / MANIFEST).exists():
@@ -219,6 +224,7 @@ def open_folder(
         # Another sweep may have started and ended meanwhile.
         require_empty(directory, locked=True)
     facts = {"key": sweep.key, "count": sweep.count, "seed": sweep.seed, "accept": sweep.accept, "files": digests}
+    facts |= {"certify": certify_plan(sweep)} if sweep.certify else {}
     for name, text in texts.items():
         write_text(directory / name, text)
     manifest.create({**facts, "per_shard": per_shard, "part": list(settings.part), **program()})
@@ -251,6 +257,7 @@ def _remove_trajectories(directory: Path, copied: Mapping[str, str], spared: Col
     remove_card(directory)
     for name in (PENDING, QUARANTINE, SHARDS):
         remove_numbered(directory / name, NUMBERED)
+    remove_numbered(directory / CERTIFICATES, NAMES)
     for name in copied_files(copied):
         path = directory / name
         if path.is_file() and path.resolve() not in spared and path_digest(path) == copied[name]:
@@ -347,9 +354,11 @@ class _Run:
         self, joined: Workers | None, began: float, on_progress: Callable[[SweepState], None], stop: Callable[[], bool]
     ) -> None:
         state, missing = self.state, [n for n in self.folder.all_numbers() if n not in self.rows]
-        if not missing:
+        chosen = {*certify_plan(self.sweep)["numbers"]} - certificates(self.folder.path)[0].keys()
+        chosen &= {n for n in self.folder.all_numbers() if n not in self.rows or self.rows[n].accepted}
+        if not missing and not chosen:
             return
-        count = min(self.settings.processes, len(missing))
+        count = min(self.settings.processes, max(len(missing), len(chosen)))
         with nullcontext(joined) if joined else local_workers(count) as workers:
             since = time.perf_counter()
             state.start_seconds = since - began
@@ -359,6 +368,13 @@ class _Run:
                 state.seconds = time.perf_counter() - since
                 if ended == workers.count:
                     state.settled = state.done, state.seconds
+                on_progress(state)
+            # The largest first: the device is allocated once.
+            rows = sorted((self.rows[n] for n in chosen if self.rows[n].accepted), key=lambda row: -row.particles)
+            tasks = _tasks(self.sweep, self.settings, [row.number for row in rows], max(1, len(rows)))
+            tasks = [replace(task, certified=row) for task, row in zip(tasks, rows, strict=True)]
+            for _, found in workers.outcomes(tasks, stop):
+                state.certified += found is not None
                 on_progress(state)
 
     def take(self, rows: Sequence[Row]) -> None:
@@ -404,7 +420,8 @@ def _tasks(sweep: Sweep, settings: SweepSettings, numbers: Sequence[int], worker
 class Rehearsed:
     """One trajectory: values by key, counts, bytes without compression, seconds, and its fault, if any.
 
-    Seconds are those of one thread from the table of costs, 0 if the trajectory cannot be computed.
+    Seconds are those of one thread from the table of costs, 0 if the trajectory cannot be computed; `certify_seconds`
+    those of its siblings, 0 if it has none.
     """
 
     number: int
@@ -415,15 +432,17 @@ class Rehearsed:
     bytes: int
     seconds: float
     fault: str
+    certify_seconds: float = 0.0
 
 
 @dataclass(frozen=True)
 class Rehearsal:
-    """Trajectories of a part, the number of workers, and the splits without trajectories in the sweep."""
+    """Trajectories of a part, the number of workers, the splits without trajectories, and `plan_text` if certified."""
 
     trajectories: tuple[Rehearsed, ...]
     workers: int
     empty: tuple[str, ...] = ()
+    plan: str = ""
 
     @property
     def passes(self) -> bool:
@@ -438,12 +457,12 @@ class Rehearsal:
     @property
     def seconds(self) -> float | None:
         """Expected wall time, None if no trajectory can be computed."""
-        return sum(one.seconds for one in self.trajectories) / self.workers or None
+        return sum(one.seconds + one.certify_seconds for one in self.trajectories) / self.workers or None
 
     def as_dict(self) -> dict:
         """Return it for JSON."""
         whole = {"ok": self.passes, "trajectories": [vars(one) for one in self.trajectories], "bytes": self.bytes}
-        return {**whole, "seconds": self.seconds, "workers": self.workers}
+        return {**whole, "seconds": self.seconds, "workers": self.workers, "certify": self.plan}
 
     def text(self) -> str:
         """Return it as text: the first draws, the faults, and the forecast."""
@@ -464,6 +483,13 @@ class Rehearsal:
         time_text = "" if self.seconds is None else f", about {duration_text(self.seconds)}"
         total, workers = counted(len(self.trajectories), "trajectory"), counted(self.workers, "worker")
         lines += [f'note: no trajectory is in the split "{name}": raise count' for name in self.empty]
+        if self.plan:
+            more, every = (
+                sum(getattr(one, name) for one in self.trajectories) for name in ("certify_seconds", "seconds")
+            )
+            numbers = ", ".join(str(one.number) for one in self.trajectories if one.certify_seconds) or "none here"
+            share = f"about {duration_text(more)}, {more / (every or 1.0):.0%} of the time of the trajectories"
+            lines.append(f"certify: {self.plan}: {numbers}; {share}")
         lines.append(f"{total}: {size_text(self.bytes)}{time_text} with {workers}, compilation apart")
         return "\n".join(lines)
 
@@ -473,7 +499,7 @@ def rehearse(sweep: Sweep, settings: SweepSettings) -> Rehearsal:
     laws = load_plugins(settings.plugins)
     per_shard = _per_shard(_bytes_of_trajectories(sweep, settings))
     folder = Folder(settings.directory, sweep.count, per_shard, settings.part)
-    found = []
+    found, plan = [], certify_plan(sweep)
     for number in folder.all_numbers():
         values, fault, counts = {}, "", (0, 0, 0, 0.0)
         try:
@@ -486,10 +512,12 @@ def rehearse(sweep: Sweep, settings: SweepSettings) -> Rehearsal:
             counts = particles, steps, trajectory_bytes(loaded.scene, particles), seconds
         except InputError as error:
             fault = str(error)
-        found.append(Rehearsed(number, sweep.split_of(number), values, *counts, fault))
+        siblings = counts[-1] * cost_of_one(sweep) if number in plan["numbers"] else 0.0
+        found.append(Rehearsed(number, sweep.split_of(number), values, *counts, fault, siblings))
     used = {sweep.split_of(number) for number in range(min(sweep.count, SURE))}
     empty = tuple(name for name, share in sweep.split if share > 0 and name not in used)
-    return Rehearsal(tuple(found), settings.processes, empty)
+    text = plan_text(sweep.count, **plan) if sweep.certify else ""
+    return Rehearsal(tuple(found), settings.processes, empty, text)
 
 
 def _short(value: Any) -> str:

@@ -119,6 +119,12 @@ class Observer:
             lows, highs = zip(*bounds, strict=True)
             self._bounds.append((np.min(lows, 0), np.max(highs, 0)))
 
+    def taken(self, frames: Iterable[Frame], ledger: Iterable[LedgerRow]) -> Series:
+        """Return the observables of all frames of a run."""
+        for frame, row in zip(frames, ledger, strict=True):
+            self.take(frame, row)
+        return self.series()
+
     def series(self) -> Series:
         """Return the observables of the frames taken."""
         # A body that enters later has no values before.

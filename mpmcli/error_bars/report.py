@@ -1,6 +1,5 @@
 """What a reader sees of a study: lines, tables, a page with figures, JSON, and the spacing that keeps a target."""
 
-import io
 import json
 import math
 from pathlib import Path
@@ -15,7 +14,7 @@ from mpmcli.errors import InputError
 from mpmcli.output.durable import sealed, write_text, writing
 from mpmcli.plain_json import finite_json
 from mpmcli.plain_text import counted, duration_text, markdown_table, plain_number, text_table
-from mpmcli.plot.style import LIGHT_SERIES, THEMES, drawing
+from mpmcli.plot.style import LIGHT_SERIES, THEMES, drawing, svg
 from mpmcli.scene import Scene
 from mpmcli.scene.problem import hint_at, listed, several
 from mpmcli.scene.quantity import AXES
@@ -205,7 +204,7 @@ def draw_bands(study: Study) -> bytes:
             axes.fill_between(bars.time, one.value - one.bar, one.value + one.bar, color=LIGHT_SERIES[5], alpha=0.5)
             axes.plot(bars.time, one.value, color=LIGHT_SERIES[0])
             axes.set(title=name, ylabel=unit_of(name).strip(), xlabel="t, s")
-        return _svg(figure)
+        return svg(figure)
 
 
 def draw_cost(study: Study) -> bytes:
@@ -227,10 +226,4 @@ def draw_cost(study: Study) -> bytes:
             axis.set_minor_formatter("")
         axes.set(xlabel="seconds", ylabel="share of the mass that is elsewhere", title="Seconds against error")
         axes.legend()
-        return _svg(figure)
-
-
-def _svg(figure: Any) -> bytes:
-    content = io.BytesIO()
-    figure.savefig(content, format="svg", metadata={"Date": None, "Creator": None})
-    return content.getvalue()
+        return svg(figure)

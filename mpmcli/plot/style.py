@@ -1,5 +1,6 @@
 """The style of figures: colours for colour-blind readers, on light and on dark ground."""
 
+import io
 import warnings
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -77,6 +78,13 @@ def drawing(size: tuple[int, int], theme: Theme) -> "AbstractContextManager[Figu
         "figure.facecolor": theme.ground,
     }
     return empty_figure(inches, LEDGER, settings, (0.09, 0.07), dpi)
+
+
+def svg(figure: "Figure", title: str = "") -> bytes:
+    """Return a figure as SVG, the same bytes each time."""
+    content = io.BytesIO()
+    figure.savefig(content, format="svg", metadata={"Date": None, "Creator": None, "Title": title})
+    return content.getvalue()
 
 
 def pixels(figure: "Figure") -> np.ndarray:
