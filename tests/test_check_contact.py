@@ -35,8 +35,15 @@ def disc(mu: float = 0.1, slope: float = 0.0, d: int = 2, **more: object) -> Sce
     return scene_of(domain=domain, time={"end": END, "frames": COUNT - 1}, bodies=[body], contact={"default": "auto"})
 
 
-def told(scene: Scene, motion: Callable[[float], tuple[float, float, float, float]]) -> list[Finding]:
-    """Return what is found in a ball that moves along x: `motion` gives its way, speed, angle and spin at a time."""
+def told(
+    scene: Scene,
+    motion: Callable[[float], tuple[float, float, float, float]],
+    hop: Callable[[float], tuple[float, float]] = lambda t: (0.0, 0.0),
+) -> list[Finding]:
+    """Return what is found in a ball that moves along x: `motion` gives its way, speed, angle and spin at a time.
+
+    `hop` gives its height and how fast it rises.
+    """
     findings = FrameFindings()
     check = ContactCheck(header_of(scene), findings)
     x, d = sample_bodies(scene)[0].position, scene.dimension
@@ -48,10 +55,9 @@ def told(scene: Scene, motion: Callable[[float], tuple[float, float, float, floa
         turn[:2, :2] = [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
         out[:2, :2] = [[0.0, -spin], [spin, 0.0]]
         r = (x - center) @ turn.T
-        ahead = np.eye(d)[0]
-        check.check(
-            Frame(k, t, k, center + way * ahead + r, speed * ahead + r @ out.T, label, label), made_row(k, d, time=t)
-        )
+        up, rise = hop(t)
+        moved, speeds = (np.pad([along, y], (0, d - 2)) for along, y in ((way, up), (speed, rise)))
+        check.check(Frame(k, t, k, center + moved + r, speeds + r @ out.T, label, label), made_row(k, d, time=t))
     check.end()
     return list(findings.found())
 
@@ -83,6 +89,14 @@ def test_a_body_that_slides_below_its_friction_angle_is_found() -> None:
     found = told(disc(0.4, 0.1), lambda t: (0.3 * t, 0.3, 0.0, 0.0))
     assert [one.rule for one in found][:1] == ["slides"]
     assert found[0].value == pytest.approx(math.tan(0.1), rel=1e-3)
+
+
+def test_a_body_that_hops_does_not_slide() -> None:
+    """The same in hops of 0.06 s and 4 mm: in an impact friction stops the surface, and then is what it must be."""
+    fall, lasts = G * math.cos(0.1), 0.06
+    hop = lambda t: (fall / 2 * (t % lasts) * (lasts - t % lasts), fall * (lasts / 2 - t % lasts))  # noqa: E731
+    found = told(disc(0.4, 0.1), lambda t: (0.3 * t, 0.3, 0.0, 0.0), hop)
+    assert "slides" not in [one.rule for one in found]
 
 
 @pytest.mark.parametrize("turns", [0.0, 0.5, -1.0])

@@ -19,6 +19,7 @@ from mpmcli.errors import InputError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.materials.registry import parameter_models
+from mpmcli.output import open_result
 from mpmcli.scene import load_scene, parse_scene, sample_bodies
 from mpmcli.scene.examples import examples
 
@@ -302,6 +303,8 @@ def test_a_run_says_how_wrong_it_is(bars: tuple[Path, dict]) -> None:
     assert found["headline"] in (directory / "error_bars" / "report.md").read_text()
     shown = run_here("info", directory, "--json")
     assert json.loads(shown.stdout)["headline"] == found["headline"]
+    # Where the files are that the scene names, if it does; `validate RESULT` finds them there.
+    assert open_result(directory).record["scene"] == str(directory.with_name("drop.toml"))
 
 
 def test_runs_that_are_kept_are_not_computed_again(bars: tuple[Path, dict], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -330,7 +333,6 @@ def test_runs_that_are_kept_are_not_computed_again(bars: tuple[Path, dict], monk
 def test_the_result_is_plotted_with_bands_and_overwritten_with_its_bars(
     bars: tuple[Path, dict], tmp_path: Path
 ) -> None:
-    from mpmcli.output import open_result
     from mpmcli.plot.ledger_figure import read_history
 
     directory, _ = bars

@@ -191,3 +191,18 @@ def places(data):
         yield data, key
         if isinstance(data[key], dict | list):
             yield from places(data[key])
+
+
+def test_the_copy_of_a_scene_finds_the_files_of_the_original(tmp_path: Path) -> None:
+    """A result has a copy of its scene; what that names is relative to the scene that was run."""
+    first, second = (tmp_path / name / "scene.toml" for name in ("here", "there"))
+    text = 'domain = { size = [1, 1], spacing = 0.1 }\ntime = { end = 1, frames = 1 }\n[[bodies]]\nname = "a"\n'
+    text += 'material = "water"\nshape = { points = { file = "a.csv", spacing = 0.05 } }\n'
+    for path in (first, second):
+        path.parent.mkdir()
+        path.write_text(text)
+    (tmp_path / "here" / "a.csv").write_text("x,y\n0.5,0.5\n")
+    with pytest.raises(InputError, match="no such file"):
+        load_scene(second, laws=parameter_models())
+    loaded = load_scene(second, laws=parameter_models(), original=first)
+    assert loaded.source == str(first) and loaded.scene == load_scene(first, laws=parameter_models()).scene

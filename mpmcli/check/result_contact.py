@@ -24,6 +24,8 @@ AGREE, HALF = 0.99, 0.5
 # Cells of sliding, its share of the way of the centre, and the coefficient of friction measured over that given, beyond
 # which a body slides too easily.
 SLID, SHARE, RUBS = 3.0, 0.1, 0.7
+# Speed of the centre normal to an obstacle, over that along it, up to which a body slides and does not hop or tip.
+STAYS = 0.1
 # Relative error of the spin of a ball that is reported, if neither the speed of its rim nor its own is below TURNS of
 # the other: a soft ball may rest on a slope.
 SPUN, TURNS = 0.25, 0.1
@@ -181,7 +183,9 @@ class ContactCheck(FrameCheck):
         slide.found = slide.found + after.spin - before.spin
         slip = 0.5 * (before.slip + after.slip)
         slide.moved += float(np.linalg.norm(_along(after.momentum, n))) / after.mass * span
-        if before.slip @ after.slip > 0 and given @ n > 0:
+        # In hops, friction stops the surface in each impact, and the body springs back: only what stays down slides.
+        stays = all(abs(one.momentum @ n) < STAYS * np.linalg.norm(_along(one.momentum, n)) for one in (before, after))
+        if before.slip @ after.slip > 0 and given @ n > 0 and stays:
             slide.way = slide.way + slip * span
             slide.rubbed -= float(given @ slip)
             slide.pressed += float(given @ n * np.linalg.norm(slip))

@@ -154,7 +154,8 @@ def _study_of(path: Path, output: Path | None, asked: dict[str, Any]) -> tuple["
             raise InputError(f"--set changes scenes, and {path} is not one; leave it out.")
         if result.status != "finished":
             raise InputError(f'{path} is of a run that is "{result.status}": error bars need all its frames.')
-        loaded = load_scene(result.directory / SCENE, laws=laws)
+        original = (result.record or {}).get("scene", "")
+        loaded = load_scene(result.directory / SCENE, laws=laws, original=original)
         output = output or result.directory / ERROR_BARS
         plan = plan_for(loaded, output, asked)
         if asked["budget"]:

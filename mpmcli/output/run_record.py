@@ -30,6 +30,7 @@ class RunRecord:
     Attributes:
         directory: directory of run.json; not part of it.
         command: command line; the program's name comes first, without its path.
+        scene: path of the scene; the names of the files that it reads are relative to its directory.
         backend: arch, threads, precision, and device name if known, of the backend in use.
         files: SHA-256 of each file that the scene reads, by name.
         resumed: for each resumption: its time (at), the frames kept, and the first step.
@@ -47,6 +48,7 @@ class RunRecord:
 
     directory: Path
     command: Sequence[str] = ()
+    scene: str = ""
     backend: dict[str, Any] = field(default_factory=dict)
     seeds: dict[str, int] = field(default_factory=dict)
     forced: bool = False
@@ -125,6 +127,7 @@ class _StoredRecord(BaseModel):
 
     program: Literal["mpmcli"]
     status: str = "unknown"
+    scene: str = ""
     backend: dict[str, str | int] = {}
     files: dict[str, str] = {}
     forced: bool = False

@@ -97,20 +97,25 @@ class LoadedScene:
         return {File(self.source).resolve(), *((File(self.source).parent / name).resolve() for name in names)}
 
 
-def load_scene(path: str | PathLike[str], overrides: Sequence[str] = (), *, laws: Laws) -> LoadedScene:
+def load_scene(
+    path: str | PathLike[str], overrides: Sequence[str] = (), *, laws: Laws, original: str | PathLike[str] = ""
+) -> LoadedScene:
     """Read a scene from a TOML file.
 
     Args:
         path: the file.
         overrides: values to replace, `KEY=VALUE` each; see `toml_file.apply_overrides`.
         laws: parameter models of the constitutive laws that a material may follow.
+        original: the scene of which this one is the copy in a result: what it names is relative to that.
 
     Raises:
         InputError: one line per fault: `FILE:LINE: KEY PATH: fault and correction`.
     """
     text, data = read_scene(path)
-    directory = File(path).parent
-    return parse_scene(data, laws=laws, source=str(path), text=text, overrides=overrides, directory=directory)
+    source = original or path
+    return parse_scene(
+        data, laws=laws, source=str(source), text=text, overrides=overrides, directory=File(source).parent
+    )
 
 
 def parse_scene(

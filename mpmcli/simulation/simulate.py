@@ -224,6 +224,7 @@ class StoredRun:
         self._record = RunRecord(
             self._directory,
             command=self.settings.command,
+            scene=str(Path(self.loaded.source).resolve()),
             backend=summary.backend,
             seeds={one.name: one.seed for one in scene.sources if one.sampling in ("jittered", "poisson")},
             forced=self._forced,
