@@ -200,7 +200,7 @@ def growth(rows: Sequence[LedgerRow]) -> float:
 def test_still_water_rests(backend_of: Callable, record_property: Callable) -> None:
     """On a slope, a floor, between bevels, in bowls, a turned tank, a moat and a U tube, around a disc and two boxes.
 
-    Kinetic energy is below 1.5e-5 of M g h after 2 s, energy never rises, `check` finds nothing, and what carries the
+    Kinetic energy is below 7e-6 of M g h after 2 s, energy never rises, `check` finds nothing, and what carries the
     water has its weight. So does what moves: a dam that runs up a slope, and a U tube with unequal levels, lose energy
     all the time. In a round bowl water rests with a friction of 0.01.
     """
@@ -211,18 +211,36 @@ def test_still_water_rests(backend_of: Callable, record_property: Callable) -> N
         first, last, weight = frames[0][0].position, frames[-1][0].position, rows[0].mass * G
         height = float(np.ptp(first[:, 1]))
         record_property(f"{name}: kinetic energy over M g h", rows[-1].kinetic / (weight * height))
-        # Beside a box volumes close by little (5.11 of docs/theory.md).
-        assert growth(rows) <= (1e-4 if name == "crate" else 1e-6) * weight * height, name
+        # Beside a box and in a round bowl volumes close by little (5.11 of docs/theory.md).
+        assert growth(rows) <= {"crate": 1e-4, "round": 1e-5}.get(name, 1e-6) * weight * height, name
         header = header_of(scenes[name], "fluid", "f32")
         assert check_kept(header, *zip(*frames, strict=True)).findings == (), name
         if name in MOVING:
             continue
-        assert rows[-1].kinetic < 1.5e-5 * weight * height, name
+        assert rows[-1].kinetic < 7e-6 * weight * height, name
         drift = np.linalg.norm(last - first, axis=1) / H
         assert drift.max() < 2.5 and drift.mean() < 0.6, name
         force = -np.mean([np.sum(row.collider_force, axis=0)[1] for row in rows[20:]])
         within = {"bevels": 0.015, "disc": 0.015, "crate": 0.02, "tilted": 0.02}.get(name, 1e-3)
         assert force / weight == pytest.approx(carried(name), rel=within), name
+
+
+@pytest.mark.parametrize("off", [0.0, 0.3])
+def test_water_beside_a_wall_of_colliders_rests_wherever_its_face_is(backend_of: Callable, off: float) -> None:
+    """Twenty cells of water beside a collider whose face is on nodes, or 0.3 h beside them, for 2 s.
+
+    A uniform pressure up to the face is at rest only if points share their impulses among nodes as MLS-MPM does the
+    force of a stress; otherwise the last column of particles has 0.88 of the pressure, and sinks ever faster.
+    """
+    face = 0.4 + off * H
+    scene = scene_of(
+        domain={"size": [0.8, 0.6], "spacing": H, "gravity": [0.0, -G]},
+        time={"end": 2.0, "frames": 4},
+        bodies=[{"name": "water", "material": "water", "shape": box([0.0, 0.0], [face, 0.4])} | AT_REST],
+        colliders=[{"name": "gate", "shape": box([face, -0.1], [0.6, 0.7])}],
+    )
+    ((*_, (last, row)),) = outputs_of(batch_of([scene], backend_of("f32", 1)), [scene])
+    assert row.kinetic < 1e-7 * row.mass * G * 0.4
 
 
 def carried(name: str) -> float:
