@@ -370,8 +370,10 @@ class ColliderPoints(Feature):
             weight = 0.0
             if acts > 0.0 and self.weights[p * self.stencil + c] > 0.0:
                 filled = ti.min(self.weights[p * self.stencil + c] / full, 1.0)
-                weight = self.weight(along, c) * self.borne(place, self.normal[p], c)
-                weight *= filled + (1.0 - filled) * whole
+                weight = self.weight(along, c) * (filled + (1.0 - filled) * whole)
+                # What sticks cannot sink; sheared sand vibrates where the points of a lid bear like this.
+                if self.colliders.wall[i] != STICK:
+                    weight *= self.borne(place, self.normal[p], c)
                 other = self.around(node, c, 1)
                 own, _sign = self.owner(walls, other)
                 self.spread[self.place(grid.linear_index(own))] = -1.0
