@@ -396,8 +396,8 @@ def test_a_scene_without_siblings_is_told_so(tmp_path: Path) -> None:
     [
         (("--level", "step", "--budget", "1h"), "without --level, --only and --skip"),
         (("--only", "grids"), 'there is no cause "grids"'),
-        (("--skip", "grid"), "leaves nothing to compute"),
-        (("--only", "model"), "leaves nothing to compute"),
+        (("--skip", "grid"), "leave nothing to compute, as model needs grid"),
+        (("--only", "step", "--skip", "step"), "leave nothing to compute:"),
         (("--budget", "0.001s"), "allows nothing"),
         (("--levels", "fine"), "--levels"),
     ],

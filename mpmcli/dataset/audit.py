@@ -16,8 +16,9 @@ from typing import Any
 
 import numpy as np
 
+from mpmcli.dataset.certify import STD_LEAST
 from mpmcli.dataset.exported import trajectories
-from mpmcli.dataset.metadata import EXPORTED_BY, STD_LEAST
+from mpmcli.dataset.metadata import EXPORTED_BY
 from mpmcli.dataset.shard import SPLITS
 from mpmcli.frames.frame import ACTIVE
 from mpmcli.output.header import nearest_image

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mpmcli.dataset.shard import LABELS, MOVING, StoredGroup, group_name, open_shard
+from mpmcli.dataset.shard import CERTIFICATES, LABELS, MOVING, StoredGroup, group_name, open_shard
 from mpmcli.dataset.sweep import Sweep
 from mpmcli.error_bars.bars import bars_of
 from mpmcli.error_bars.observables import DENSITY, Map, Observer
@@ -34,16 +34,19 @@ from mpmcli.scene.quantity import dimension_of
 if TYPE_CHECKING:
     from mpmcli.simulation.runner import Runner
 
-# The directory of certificates in a dataset, and their names; the figure, its title, by which it is known, its size.
-CERTIFICATES, NAMES = "certify", re.compile(r"\d{6,}\.json")
+# The names of certificates; the figure, its title, by which it is known, its size.
+NAMES = re.compile(r"\d{6,}\.json")
 FIGURE, TITLE, SIZE = "certify.svg", "Errors of the simulator", (1000, 420)
 # Fewest trajectories, unless their siblings take more than this share of the runs of the sweep.
 FEWEST, MOST_COST = 8, 0.25
 # Particles are twins if they start within a share of a cell; nearly all must have one. States are the same while twins
 # are within another share.
 SAME_PLACE, NEARLY_ALL, SAME_STATE = 1e-3, 0.95, 0.1
-# Strides of exports that have a one-step error, and the least deviation that it is compared with, m.
-STRIDES, STD_LEAST = range(1, 11), 1e-7
+# Strides of exports that have a one-step error.
+STRIDES = range(1, 11)
+# Standard deviations below it, m, become 1, as in LagrangeBench (data_gen/lagrangebench_data/gen_dataset.py): it avoids
+# a division by zero along a direction without motion.
+STD_LEAST = 1e-7
 # Frames of the table, besides the last one.
 HORIZONS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 
@@ -226,6 +229,11 @@ def mean_of(values: Sequence[Any], most: int | None = None) -> Any:
     return np.sqrt(np.mean(np.square([value[:most] for value in values]), axis=0)).tolist()
 
 
+def divisor(std: Any) -> np.ndarray:
+    """Return the standard deviations by which numbers are divided, those without motion replaced by 1."""
+    return np.where(np.less(std, STD_LEAST), 1.0, std)
+
+
 def _kind(name: str) -> str:
     """Return the kind of an observable: its name without axis, and without body if there is something left."""
     return name if name.startswith("energy.") else name.split(".")[-2:][0]
@@ -244,7 +252,7 @@ def error_of(directory: Path) -> dict[str, Any] | None:
         return None
     all_measured = [one["measured"] for one in found]
     measured = mean_of(all_measured, min(len(one["time_s"]) for one in all_measured))
-    steps = {k: np.divide(one["error"], np.maximum(one["std"], STD_LEAST)) for k, one in measured["one_step"].items()}
+    steps = {k: np.divide(one["error"], divisor(one["std"])) for k, one in measured["one_step"].items()}
     return {
         "trajectories": [one["number"] for one in found],
         "left_out": [f"trajectory {one['number']}, {why}" for one in found for why in one["left_out"]],

@@ -113,10 +113,10 @@ def _unnested(row: Any) -> np.ndarray:
 
 
 def _of_mesh(path: Path) -> dict[str, np.ndarray]:
-    """Return the arrays of one frame in a file that meshio reads."""
-    import meshio
+    """Return the arrays of one frame in a .vtu or a .ply; `meshio.read` would end the process on a damaged one."""
+    from meshio import ply, vtu
 
-    mesh = meshio.read(path)
+    mesh = (ply if path.suffix == ".ply" else vtu).read(path)
     found = {"position": mesh.points, **mesh.point_data}
     if {"vx", "vy", "vz"} <= found.keys():
         found["velocity"] = np.stack([found.pop(name) for name in ("vx", "vy", "vz")], axis=1)
@@ -167,8 +167,10 @@ def trajectories(directory: Path) -> Iterator[tuple[str, str, str, dict[str, Any
                 if arrays["position"].dtype.kind != "f" or (meta.get("bounds") and np.shape(meta["bounds"]) != (d, 2)):
                     raise ValueError(f"{name} has no positions as floats, or bounds are not a pair per component")
                 yield (f"{path.name}/{name}", split, form, arrays, meta, own)
-    except (ArithmeticError, AttributeError, EOFError, LookupError, OSError, pickle.PickleError, TypeError, ValueError,
-            tarfile.TarError, zipfile.BadZipFile) as error:  # fmt: skip
+    except InputError:
+        raise
+    except Exception as error:
+        # Whatever a reader of another package raises: the file is not what its name says.
         raise InputError(f"{path} cannot be read as {form} of an export ({error}).") from error
     if not files:
         raise InputError(f"{directory} holds no trajectories in a format that mpmcli export writes.")

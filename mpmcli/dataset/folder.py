@@ -21,8 +21,17 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
 from mpmcli import __version__
 from mpmcli.check.finding import Verdict
-from mpmcli.dataset.certify import CERTIFICATES
-from mpmcli.dataset.shard import BASE, PENDING, QUARANTINE, SHARDS, SWEEP, checksum, group_name, join_trajectories
+from mpmcli.dataset.shard import (
+    BASE,
+    CERTIFICATES,
+    PENDING,
+    QUARANTINE,
+    SHARDS,
+    SWEEP,
+    checksum,
+    group_name,
+    join_trajectories,
+)
 from mpmcli.dataset.sweep import Sweep
 from mpmcli.errors import InputError, RunError
 from mpmcli.output.checksums import first_line, path_digest, require_format

@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from mpmcli.dataset.certify import CERTIFICATES
 from mpmcli.dataset.folder import (
     PROGRAM,
     Manifest,
@@ -16,7 +15,7 @@ from mpmcli.dataset.folder import (
     require_same_program,
 )
 from mpmcli.dataset.report import CARD, Status, status_of, verify, write_card
-from mpmcli.dataset.shard import BASE, QUARANTINE, SHARDS, SWEEP
+from mpmcli.dataset.shard import BASE, CERTIFICATES, QUARANTINE, SHARDS, SWEEP
 from mpmcli.errors import InputError
 from mpmcli.output.durable import require_free_space, sealed, write_text, writing
 from mpmcli.output.lock import take_lock

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from mpmcli import __version__
+from mpmcli.dataset.certify import divisor
 from mpmcli.dataset.shard import SPLITS, group_name
 from mpmcli.dataset.subsample import SubsampledTrajectory
 from mpmcli.errors import InputError
@@ -22,9 +23,6 @@ FORMAT_KEY, FORMAT = "export_format", 3
 # Tolerance as a fraction of the time between frames: steps end at frames exactly, up to the rounding of sums.
 UNEVEN = 1e-6
 LEAST_FRAMES = 3
-# Standard deviations below it become 1, as in LagrangeBench (data_gen/lagrangebench_data/gen_dataset.py): it avoids a
-# division by zero along a direction without motion.
-STD_LEAST = 1e-7
 
 
 def common_facts(trajectories: Sequence[SubsampledTrajectory], stride: int) -> dict[str, Any]:
@@ -253,4 +251,4 @@ def _over_trajectories(moments: Iterable[Moments]) -> tuple[np.ndarray, np.ndarr
     # The mean squared distance from the overall mean, without a second pass.
     variance = (np.array([each.variance for each in moments]) + np.square(means - mean)).mean(axis=0)
     std = np.sqrt(variance)
-    return mean, np.where(std < STD_LEAST, 1.0, std)
+    return mean, divisor(std)

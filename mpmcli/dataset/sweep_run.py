@@ -15,7 +15,7 @@ import numpy as np
 from mpmcli.check.facts import SceneFacts
 from mpmcli.check.forecast import expected_steps, layout_of, seconds_of_one
 from mpmcli.cores import available_cores
-from mpmcli.dataset.certify import CERTIFICATES, NAMES, certificates, certify_plan, cost_of_one, plan_text
+from mpmcli.dataset.certify import NAMES, certificates, certify_plan, cost_of_one, plan_text
 from mpmcli.dataset.compute import Task, Workers, joined_workers, local_workers, scene_fault
 from mpmcli.dataset.draw import draw
 from mpmcli.dataset.folder import (
@@ -36,7 +36,7 @@ from mpmcli.dataset.folder import (
     standing_alone,
 )
 from mpmcli.dataset.report import final_rows, remove_card, require_own_tables, write_card
-from mpmcli.dataset.shard import BASE, LABELS, NUMBERED, PENDING, QUARANTINE, SHARDS, SWEEP, file_name
+from mpmcli.dataset.shard import BASE, CERTIFICATES, LABELS, NUMBERED, PENDING, QUARANTINE, SHARDS, SWEEP, file_name
 from mpmcli.dataset.sweep import Sweep
 from mpmcli.errors import InputError
 from mpmcli.materials.registry import load_plugins

@@ -117,9 +117,9 @@ class StudyPlan:
 def chosen_causes(level: Level, only: Sequence[str] = (), skip: Sequence[str] = ()) -> tuple[Cause, ...]:
     """Return the causes of a level, or those named, without others; InputError: none is left."""
     causes = tuple(cause for cause in (only or LEVELS[level]) if cause not in skip)
-    # Other choices of the model are compared on the coarsest grid.
-    if causes in ((), ("model",)):
-        raise InputError("--skip leaves nothing to compute: give fewer, or another --level.")
+    if not {*causes} - {"model"}:
+        why = ", as model needs grid" if causes else ""
+        raise InputError(f"--only and --skip leave nothing to compute{why}: give other causes, or another --level.")
     return tuple(cause for cause in CAUSES if cause in causes)
 
 
