@@ -211,8 +211,8 @@ def test_still_water_rests(backend_of: Callable, record_property: Callable) -> N
         first, last, weight = frames[0][0].position, frames[-1][0].position, rows[0].mass * G
         height = float(np.ptp(first[:, 1]))
         record_property(f"{name}: kinetic energy over M g h", rows[-1].kinetic / (weight * height))
-        # Beside a box volumes close by little (5.11 of docs/theory.md). In a round bowl the step adds more than friction
-        # takes; with half of it energy falls all the time.
+        # Beside a box volumes close by little (5.11 of docs/theory.md). In a round bowl the step adds more than
+        # friction takes; with half of it energy falls all the time.
         assert growth(rows) <= {"crate": 1e-4, "round": 1e-5}.get(name, 1e-6) * weight * height, name
         header = header_of(scenes[name], "fluid", "f32")
         assert check_kept(header, *zip(*frames, strict=True)).findings == (), name
