@@ -25,7 +25,7 @@ MODULES = {
     "bodies that separate": {f"solver.contact.{name}" for name in ("body_contact", "shared_field", "surfaces")},
     # Not asked for by the scene with features either.
     "grids of distances": {"boundaries.distances.GridDistance"},
-    "means of volume": {f"solver.transfer.volume.{name}" for name in ("cell_of", "average_range", "average_for_frame")},
+    "means of volume": {f"solver.transfer.volume.{name}" for name in ("cell_of", "add_volume", "average_for_frame")},
 }
 
 

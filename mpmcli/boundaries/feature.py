@@ -6,7 +6,7 @@ A step carries out the phases of the engine and of all features, in the order of
 from collections.abc import Callable, MutableMapping
 from copy import copy
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -35,8 +35,7 @@ class Phase:
         turns: number of repetitions, with `turn` counting from 0.
         rounds: number of times that all turns are repeated.
         body: function of one node or particle on any device: body(at, node, kick), or in a shift body(at, node or
-            particle, time over which volumes relax).
-        ranged: the same for a range of particles on the CPU.
+            particle, time over which volumes relax); or an `Operation` on particles (`solver.particles.loop`).
         wanted: function of the first node of a row on a dense grid on the CPU, which returns whether the row has work:
             wanted(at, node). Such phases have work in layer 0 alone.
         part, item: for phases with a division of work of their own, functions of a part of all items on the CPU,
@@ -52,8 +51,7 @@ class Phase:
     adds: bool = False
     turns: int = 1
     rounds: int = 1
-    body: Callable | None = None
-    ranged: Callable | None = None
+    body: Any = None
     wanted: Callable | None = None
     part: Callable | None = None
     item: Callable | None = None

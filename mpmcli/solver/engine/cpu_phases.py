@@ -21,6 +21,7 @@ from mpmcli.solver.engine.step import sorted_fields
 from mpmcli.solver.frames.reader import write_range
 from mpmcli.solver.grid.grid import clear_blocks, clear_rows
 from mpmcli.solver.grid.sparse_grid import BLOCKS, PENCILS
+from mpmcli.solver.particles.loop import over
 from mpmcli.solver.particles.sort import (
     count_tiles,
     keep_all,
@@ -33,7 +34,6 @@ from mpmcli.solver.particles.sort import (
 from mpmcli.solver.transfer.cpu_transfers import (
     advance_range,
     advance_tiles,
-    average_pencils,
     nodes_of_blocks,
     nodes_of_rows,
     scatter_pencils,
@@ -41,7 +41,7 @@ from mpmcli.solver.transfer.cpu_transfers import (
     update_blocks,
     update_rows,
 )
-from mpmcli.solver.transfer.volume import average_for_frame, average_range
+from mpmcli.solver.transfer.volume import AVERAGE, average_for_frame
 
 # Arrays of all runs: numbers, counts and frame buffer, see `Batch`.
 RunReals = ti.types.ndarray(ti.f64, 2)
@@ -280,7 +280,7 @@ class CpuPhases(RunPhases):
 
     def _add(self, name: str, group: int, first: int, length: int, phase: Phase | None = None) -> int:
         """Number phases, and return the number after the last."""
-        item, body = phase and (phase.ranged or phase.body), name
+        item, body = phase and phase.body, name
         if item:
             body = "each_node" if phase.over == "nodes" else "each_in_pencils" if phase.adds else "each_particle"
             body = "shift_nodes" if body == "each_node" and phase.shifts else body
@@ -396,23 +396,29 @@ class CpuPhases(RunPhases):
     @ti.func
     def each_in_pencils(self, at: ti.template()):
         """Apply the function of a phase to particles that add to nodes, pencil by pencil."""
+        self.in_pencils(at, at.item, at.step.relaxed)
+
+    @ti.func
+    def in_pencils(self, at: ti.template(), op: ti.template(), how: float):
+        """Carry out an operation that adds to nodes, pencil by pencil."""
         first, after = 0, 0
         if at.turn < self.colours:
             first, after = self.pencils(at.order, at.turn, at.region, at.part)
             for r in range(first, after):
                 pencil = at.order.pencil_of(at.turn, r)
                 begin, end = at.order.first_particle_of(pencil), at.order.first_particle_of(pencil + 1)
-                ti.static(at.item)(at, begin, end, at.step.relaxed)
+                over(at, op, begin, end, how)
+        # On a sparse grid a sort follows each entry of particles.
         if ti.static(self.device.particle_count_varies and not at.grid.sparse):
             if at.turn == self.colours and at.region == 0 and at.part == 0:
                 first, after = self.come_in(at.g, at.order, at.run)
-                ti.static(at.item)(at, first, after, at.step.relaxed)
+                over(at, op, first, after, how)
 
     @ti.func
     def each_particle(self, at: ti.template()):
         """Apply the function of a phase to particles."""
         first, after = self.places.particles_of(at)
-        ti.static(at.item)(at, first, after, at.step.relaxed)
+        over(at, at.item, first, after, at.step.relaxed)
 
     @ti.func
     def clear(self, at: ti.template()):
@@ -450,12 +456,8 @@ class CpuPhases(RunPhases):
         needed = at.step.relaxed > 0.0
         if ti.static(at.group.uses_f_bar):
             needed = True
-        if needed and at.turn < self.colours:
-            first, after = self.pencils(at.order, at.turn, at.region, at.part)
-            average_pencils(at, first, after)
-        elif needed and at.region == 0 and at.part == 0:
-            first, after = self.come_in(at.g, at.order, at.run)
-            average_range(at.grid, at.g, at.group, first, after, at.step.dt)
+        if needed:
+            self.in_pencils(at, AVERAGE, at.step.dt)
 
     @ti.func
     def scatter(self, at: ti.template()):
@@ -464,7 +466,6 @@ class CpuPhases(RunPhases):
         if at.turn < self.colours:
             first, after = self.pencils(at.order, at.turn, at.region, at.part)
             scatter_pencils(at, first, after, kick, relaxed)
-        # On a sparse grid a sort follows each entry of particles.
         if ti.static(self.device.particle_count_varies and not at.grid.sparse):
             if at.turn == self.colours and at.region == 0 and at.part == 0:
                 first, after = self.come_in(at.g, at.order, at.run)
@@ -578,7 +579,7 @@ class CpuPhases(RunPhases):
         """Average the volumes of the g-th group for a frame."""
         if at.region == 0:
             first = at.w * ti.static(self.device.capacity[at.g])
-            average_for_frame(at.grid, at.g, at.group, first, first + at.run.particles[at.g])
+            average_for_frame(at, first, first + at.run.particles[at.g])
 
     @ti.func
     def write_frame(self, at: ti.template()):

@@ -28,6 +28,7 @@ from mpmcli.solver.frames.reader import chosen_columns, write_range
 from mpmcli.solver.grid.grid import box_of
 from mpmcli.solver.machine.backend import launcher
 from mpmcli.solver.machine.maxima import Maxima
+from mpmcli.solver.particles.loop import one
 from mpmcli.solver.particles.sort import SPAN, keep, take
 from mpmcli.solver.particles.state_bounds import (
     GPU_WORKERS,
@@ -51,7 +52,7 @@ from mpmcli.solver.transfer.run_sums import (
     thread_count,
 )
 from mpmcli.solver.transfer.splines import PAD
-from mpmcli.solver.transfer.volume import add_volume, clear_mean, missing_to_mean
+from mpmcli.solver.transfer.volume import AVERAGE, clear_mean, missing_to_mean
 from mpmcli.stability.transfer_factors import INTERVAL
 
 
@@ -168,7 +169,7 @@ class GpuPhases(RunPhases):
     def shift_particle(self, at: ti.template()):
         """Apply the function of a phase to a particle in steps that shift particles."""
         if at.step.relaxed > 0.0:
-            ti.static(at.item)(at, at.q, at.step.relaxed)
+            one(at, at.item, at.q, at.step.relaxed)
 
     @ti.func
     def clear(self, at: ti.template()):
@@ -192,7 +193,7 @@ class GpuPhases(RunPhases):
         if ti.static(at.group.uses_f_bar):
             needed = True
         if needed:
-            add_volume(at.grid, at.g, at.group, at.q, at.step.dt)
+            one(at, AVERAGE, at.q, at.step.dt)
 
     @ti.func
     def scatter(self, at: ti.template()):
@@ -295,7 +296,8 @@ class GpuPhases(RunPhases):
         if ti.static(turn == 0):
             clear_mean(view.grid, g, view.groups[g], p)
         if ti.static(turn == 1):
-            add_volume(view.grid, g, view.groups[g], p, 0.0)
+            (at,) = ti.static((Item(view, Phase("average", "particles", "scatter", g), 0, p, self.peaks),))
+            one(at, AVERAGE, p, 0.0)
         if ti.static(turn == 2):
             view.groups[g].to_mean[p] = missing_to_mean(view.grid, g, view.groups[g], p)
 

@@ -72,13 +72,13 @@ def shift_phases(arrays: Sequence[ParticleArrays], grid: Grid) -> tuple[Phase, .
     folds = {"turns": grid.dimension}
     return (
         Phase("clear_fine", "nodes", "shift", body=by.clear_fine),
-        *(Phase("fill_fine", "particles", "shift", g, True, body=by.fill_fine, ranged=by.fill_range) for g in groups),
+        *(Phase("fill_fine", "particles", "shift", g, True, body=by.fill_fine) for g in groups),
         *[Phase("fine_to_float", "nodes", "shift", body=by.fine_to_float)] * deterministic,
         Phase("fold_fine", "nodes", "shift", **folds, body=by.fold_fine),
-        *(Phase("shift", "particles", "shift", g, True, body=by.shift, ranged=by.shift_range) for g in flowing),
+        *(Phase("shift", "particles", "shift", g, True, body=by.SHIFT) for g in flowing),
         *[Phase("shift_to_float", "nodes", "shift", body=by.shift_to_float)] * deterministic,
         Phase("fold_shift", "nodes", "shift", **folds, body=by.fold_shift),
-        *(Phase("unshift", "particles", "shift", g, body=by.unshift, ranged=by.unshift_range) for g in flowing),
+        *(Phase("unshift", "particles", "shift", g, body=by.UNSHIFT) for g in flowing),
     )
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from copy import copy
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,6 +29,20 @@ def _field(count: int, kind: type, rows: int, columns: int) -> ti.Field:
     if columns > 1:
         return ti.Matrix.field(rows, columns, kind, shape=count, layout=ti.Layout.SOA)
     return ti.field(kind, shape=count) if rows == 1 else ti.Vector.field(rows, kind, shape=count, layout=ti.Layout.SOA)
+
+
+class Column(NamedTuple):
+    """What an operation reads or writes of a particle, see `loop`.
+
+    Attributes:
+        field: its field.
+        shape: its shape, () for a number.
+        entries: the entry of the field for each of its numbers, row by row.
+    """
+
+    field: ti.Field
+    shape: tuple[int, ...]
+    entries: tuple[tuple[int, ...], ...]
 
 
 @ti.data_oriented
@@ -174,6 +189,18 @@ class ParticleArrays:
         if self.repeats:
             view.period = self.period.seen_from(run)
         return view
+
+    def column(self, name: str) -> Column:
+        """Return a column: x, v, C, "place", the position on the grid, or "deformation", J - 1 or F - I."""
+        d, square = self.dimension, tuple(np.ndindex(self.dimension, self.dimension))
+        if name in ("x", "v", "place"):
+            field = self.place_on_grid if name == "place" else getattr(self, name)
+            return Column(field, (d,), tuple(np.ndindex(d)))
+        if name == "C":
+            return Column(self.gradient, (d, d), tuple((a, c) for c, a in square))
+        if self.J_minus_1 is None:
+            return Column(self.displacement_gradient, (d, d), square)
+        return Column(self.J_minus_1, (), ((),))
 
     @property
     def state(self) -> tuple[ti.Field, ...]:

@@ -38,7 +38,7 @@ from mpmcli.solver.transfer.particle_step import Loads, NodeSums, Receiver, Send
 from mpmcli.solver.transfer.particle_update import SMALLEST_J, scatter_volume
 from mpmcli.solver.transfer.splines import bounded
 from mpmcli.solver.transfer.stencils import add_linear, gather_linear
-from mpmcli.solver.transfer.volume import average_range, missing_growth
+from mpmcli.solver.transfer.volume import missing_growth
 
 
 @ti.func
@@ -336,15 +336,6 @@ def advance_range(
                     ti.atomic_min(particles.lost[particles.first_lost + g], p)
         begin += LANES
     return sharpest
-
-
-@ti.func
-def average_pencils(at: ti.template(), first: int, last: int):
-    """Add the particles in pencils first to last - 1 of a colour to their cells."""
-    for r in range(first, last):
-        pencil = at.order.pencil_of(at.turn, r)
-        begin, after = at.order.first_particle_of(pencil), at.order.first_particle_of(pencil + 1)
-        average_range(at.grid, at.g, at.group, begin, after, at.step.dt)
 
 
 @ti.func

@@ -12,7 +12,6 @@ from mpmcli.boundaries.feature import Phase
 from mpmcli.quick_taichi import ti
 from mpmcli.solver.grid.grid import Grid
 from mpmcli.solver.particles.arrays import MASS, ParticleArrays
-from mpmcli.solver.particles.sort import stay_rolled
 from mpmcli.solver.transfer.redistribution import add_shift, fold_shift, shift_to_float
 from mpmcli.solver.transfer.stencils import gather_linear
 from mpmcli.stability.transfer_factors import EASED_FROM, EASED_TO
@@ -25,10 +24,10 @@ def ease_phases(arrays: Sequence[ParticleArrays], grid: Grid) -> tuple[Phase, ..
     near = eased if grid.layers > 1 else [g for g, group in enumerate(arrays) if not group.total]
     return (
         Phase("clear_opening", "nodes", "shift", body=clear_opening),
-        *(Phase("open_up", "particles", "shift", g, True, body=open_up, ranged=open_range) for g in near),
+        *(Phase("open_up", "particles", "shift", g, True, body=open_up) for g in near),
         *[Phase("opening_to_float", "nodes", "shift", body=shift_to_float)] * grid.deterministic,
         Phase("fold_opening", "nodes", "shift", turns=grid.dimension, body=fold_shift),
-        *(Phase("ease", "particles", "shift", g, body=ease, ranged=ease_range) for g in eased),
+        *(Phase("ease", "particles", "shift", g, body=ease) for g in eased),
     )
 
 
@@ -47,14 +46,6 @@ def open_up(at: ti.template(), p: int, time: float):
 
 
 @ti.func
-def open_range(at: ti.template(), first: int, last: int, time: float):
-    """Open up particles first to last - 1."""
-    for p in range(first, last):
-        stay_rolled(at.order.buffers.real, p)
-        open_up(at, p, time)
-
-
-@ti.func
 def ease(at: ti.template(), p: int, time: float):
     """Set the share of its stress that particle p bears."""
     grid, group, d = ti.static((at.grid, at.group, at.grid.dimension))
@@ -70,11 +61,3 @@ def ease(at: ti.template(), p: int, time: float):
     # A larger share of the same strain would be energy from nowhere.
     if share > before:
         group.store(p, group.law.released(group.stored(p), before / share), group.inner(p))
-
-
-@ti.func
-def ease_range(at: ti.template(), first: int, last: int, time: float):
-    """Ease particles first to last - 1."""
-    for p in range(first, last):
-        stay_rolled(at.order.buffers.real, p)
-        ease(at, p, time)

@@ -21,19 +21,8 @@ from mpmcli.scene.sampling import points_per_cell
 from mpmcli.solver.grid.grid import Grid, LinearNodes
 from mpmcli.solver.grid.sparse_grid import BlockNodes, SparseGrid
 from mpmcli.solver.particles.arrays import MASS, VOLUME
-from mpmcli.solver.particles.sort import stay_rolled
-from mpmcli.solver.transfer.lanes import (
-    LANES,
-    load_entry,
-    load_vectors,
-    matrix_of,
-    repeat_first,
-    store_lanes,
-    vector_of,
-    weights_of,
-    zero_lanes,
-)
-from mpmcli.solver.transfer.splines import PAD, SPLINES, TransferScheme, bounded
+from mpmcli.solver.particles.loop import STENCIL, Operation, Pass
+from mpmcli.solver.transfer.splines import PAD, SPLINES, TransferScheme
 from mpmcli.solver.transfer.stencils import add_linear, gather_linear, node_of, origin_of
 from mpmcli.solver.transfer.volume import image_along
 from mpmcli.stability.transfer_factors import FARTHEST
@@ -149,14 +138,6 @@ def fill_fine(at: ti.template(), p: int, time: float):
 
 
 @ti.func
-def fill_range(at: ti.template(), first: int, last: int, time: float):
-    """Add the volumes of particles first to last - 1 to fine nodes."""
-    for p in range(first, last):
-        stay_rolled(at.order.buffers.real, p)
-        fill_fine(at, p, time)
-
-
-@ti.func
 def fine_to_float(at: ti.template(), node: ti.template(), time: float):
     """Convert the sums of the fine nodes from fixed point."""
     for q in range(ti.static(at.grid.fine.in_cell)):
@@ -194,133 +175,82 @@ def fold_fine(at: ti.template(), node: ti.template(), time: float):
 
 
 @ti.func
-def shift(at: ti.template(), p: int, time: float):
-    """Move particle p down the gradient of the crowding; add its mass and mass times displacement to its nodes."""
-    grid, fine, group, d = ti.static((at.grid, at.grid.fine, at.group, at.grid.dimension))
-    v, C = group.motion(p)
-    x = group.x[p]
-    fine_base, fine_distance = fine.stencil(x, grid.inverse_spacing)
-    slope = slope_of(fine, fine.stencil_at(fine_base), fine.scheme.spline.weights(fine_distance), fine_distance)
+def locate(at: ti.template(), _p: int, _time: float, x: ti.template()):
+    """Return the stencil of a particle and its weights."""
+    base, distance = at.grid.scheme.spline.stencil(x, at.grid.inverse_spacing)
+    return at.grid.stencil_at(base), at.grid.scheme.spline.weights(distance)
+
+
+@ti.func
+def locate_fine(at: ti.template(), _p: int, _time: float, x: ti.template()):
+    """Return the stencil of a particle on the fine grid, its weights, and the distance from its first node."""
+    base, distance = at.grid.fine.stencil(x, at.grid.inverse_spacing)
+    return at.grid.fine.stencil_at(base), at.grid.fine.scheme.spline.weights(distance), distance
+
+
+@ti.func
+def crowd(at: ti.template(), p: int, _time: float, finer: ti.template(), fine_w: ti.template(), apart: ti.template()):
+    """Return the gradient of the crowding at a particle, and its mass."""
+    return slope_of(at.grid.fine, finer, fine_w, apart), at.group.row(p)[MASS]
+
+
+@ti.func
+def go_down(
+    at: ti.template(), _p: int, time: float, x: ti.template(), v: ti.template(), C: ti.template(), slope: ti.template()
+):
+    """Return a particle moved down the gradient of the crowding, and its displacement."""
     way = held_back(at, x, way_down(at, slope, C, time))
-    base, distance = grid.scheme.spline.stencil(x, grid.inverse_spacing)
-    even = ti.Matrix.zero(float, d, d)
-    add_shift(at, grid.stencil_at(base), grid.scheme.spline.weights(distance), group.row(p)[MASS], way, even)
-    for a in ti.static(range(d)):
-        group.x[p][a] = x[a] + way[a]
-        group.v[p][a] = v[a] + (C @ way)[a]
+    return x + way, v + C @ way, way
 
 
 @ti.func
-def unshift(at: ti.template(), p: int, time: float):
-    """Subtract the mean displacement at particle p from its position."""
-    grid, group, d = ti.static((at.grid, at.group, at.grid.dimension))
-    v, C = group.motion(p)
-    x = group.x[p]
-    base, distance = grid.scheme.spline.stencil(x, grid.inverse_spacing)
-    mean, _ = gather_linear(grid.nodes, grid, grid.stencil_at(base), grid.scheme.spline.weights(distance))
-    back = ti.Vector.zero(float, d)
-    for a in ti.static(range(d)):
+def tell_nodes(
+    at: ti.template(), _p: int, _time: float, first: ti.template(), w: ti.template(), mass: float, way: ti.template()
+):
+    """Add the mass of a particle and its mass times displacement to its nodes."""
+    even = ti.Matrix.zero(float, ti.static(at.grid.dimension), ti.static(at.grid.dimension))
+    add_shift(at, first, w, mass, way, even)
+
+
+@ti.func
+def mean_shift(at: ti.template(), _p: int, _time: float, first: ti.template(), w: ti.template()):
+    """Return the opposite of the mean displacement at a particle."""
+    mean, _ = gather_linear(at.grid.nodes, at.grid, first, w)
+    back = ti.Vector.zero(float, ti.static(at.grid.dimension))
+    for a in ti.static(range(at.grid.dimension)):
         back[a] = -mean[a]
+    return back
+
+
+@ti.func
+def go_back(
+    at: ti.template(), _p: int, _time: float, x: ti.template(), v: ti.template(), C: ti.template(), back: ti.template()
+):
+    """Return a particle without the mean displacement."""
     way = held_back(at, x, back)
-    for a in ti.static(range(d)):
-        group.x[p][a] = x[a] + way[a]
-        group.v[p][a] = v[a] + (C @ way)[a]
+    return x + way, v + C @ way
 
 
-@ti.func
-def shift_range(at: ti.template(), first: int, last: int, time: float):
-    """Shift particles first to last - 1."""
-    if ti.static(at.grid.sparse):
-        for p in range(first, last):
-            shift(at, p, time)
-    else:
-        shift_lanes(at, first, last, time, False)
-
-
-@ti.func
-def unshift_range(at: ti.template(), first: int, last: int, time: float):
-    """Subtract the mean displacements at particles first to last - 1 from their positions."""
-    if ti.static(at.grid.sparse):
-        for p in range(first, last):
-            unshift(at, p, time)
-    else:
-        shift_lanes(at, first, last, time, True)
-
-
-@ti.func
-def shift_lanes(at: ti.template(), first: int, last: int, time: float, back: ti.template()):
-    """Shift particles first to last - 1, or unshift them if `back`, LANES at a time; see `lanes`."""
-    grid, fine, group, d = ti.static((at.grid, at.grid.fine, at.group, at.grid.dimension))
-    nodes = ti.static(grid.scheme.spline.nodes)
-    x, v, affine, ways = zero_lanes(d), zero_lanes(d), zero_lanes(ti.static(d * d)), zero_lanes(d)
-    first_node, weights = ti.Vector.zero(int, LANES), zero_lanes(ti.static(nodes * d))
-    first_fine, fine_weights = ti.Vector.zero(int, LANES), zero_lanes(ti.static(3 * d))
-    distances, masses = zero_lanes(d), ti.Vector.zero(float, LANES)
-    begin = first
-    while begin < last:
-        count, origin = ti.min(LANES, last - begin), bounded(begin)
-        load_vectors(x, group.x, origin)
-        load_vectors(v, group.v, origin)
-        for c, a in ti.static(ti.ndrange(d, d)):
-            load_entry(affine, c * d + a, group.gradient, (a, c), origin)
-        if count < LANES:
-            repeat_first(x, count)
-        for lane in range(LANES):
-            base, distance = grid.scheme.spline.stencil(vector_of(x, 0, d, lane), grid.inverse_spacing)
-            first_node[lane] = grid.linear_index(base)
-            store_weights(weights, grid.scheme.spline.weights(distance), lane)
-            if ti.static(not back):
-                base, distance = fine.stencil(vector_of(x, 0, d, lane), grid.inverse_spacing)
-                first_fine[lane] = fine.linear_index(base)
-                store_weights(fine_weights, fine.scheme.spline.weights(distance), lane)
-                for a in ti.static(range(d)):
-                    distances[a, lane] = distance[a]
-        for lane in range(count):
-            stay_rolled(at.order.buffers.real, first_node[lane])
-            if ti.static(back):
-                w = weights_of(weights, nodes, d, lane)
-                mean, _ = gather_linear(grid.nodes, grid, first_node[lane], w)
-                for a in ti.static(range(d)):
-                    ways[a, lane] = -mean[a]
-            else:
-                masses[lane] = group.row(begin + lane)[MASS]
-                w = weights_of(fine_weights, 3, d, lane)
-                slope = slope_of(fine, first_fine[lane], w, vector_of(distances, 0, d, lane))
-                for a in ti.static(range(d)):
-                    ways[a, lane] = slope[a]
-        for lane in range(LANES):
-            C, way = matrix_of(affine, 0, d, lane), vector_of(ways, 0, d, lane)
-            if ti.static(not back):
-                way = way_down(at, way, C, time)
-            way = held_back(at, vector_of(x, 0, d, lane), way)
-            change = C @ way
-            for a in ti.static(range(d)):
-                ways[a, lane] = way[a]
-                x[a, lane] += way[a]
-                v[a, lane] += change[a]
-        if count == LANES:
-            for a in ti.static(range(d)):
-                store_lanes(group.x, (a,), origin, x, a)
-                store_lanes(group.v, (a,), origin, v, a)
-        else:
-            for lane in range(count):
-                stay_rolled(at.order.buffers.real, first_node[lane])
-                for a in ti.static(range(d)):
-                    group.x[begin + lane][a] = x[a, lane]
-                    group.v[begin + lane][a] = v[a, lane]
-        if ti.static(not back):
-            for lane in range(count):
-                stay_rolled(at.order.buffers.real, first_node[lane])
-                w = weights_of(weights, nodes, d, lane)
-                even = ti.Matrix.zero(float, d, d)
-                add_shift(at, first_node[lane], w, masses[lane], vector_of(ways, 0, d, lane), even)
-        begin += LANES
-
-
-@ti.func
-def store_weights(lanes: ti.template(), w: ti.template(), lane: int):
-    for k, a in ti.static(ti.ndrange(w.n, w.m)):
-        lanes[k * w.m + a, lane] = w[k, a]
+LOCATE = Pass(locate, {"first": STENCIL, "w": ("nodes", "d")}, in_lanes=True)
+MOTION = {"x": ("d",), "v": ("d",)}
+# Moves particles down the gradient of the crowding; nodes take the mean of this motion.
+SHIFT = Operation(
+    reads=("x", "v", "C"),
+    passes=(
+        LOCATE,
+        Pass(locate_fine, {"finer": STENCIL, "fine_w": (3, "d"), "apart": ("d",)}, in_lanes=True),
+        Pass(crowd, {"slope": ("d",), "mass": ()}),
+        Pass(go_down, MOTION | {"way": ("d",)}, in_lanes=True),
+        Pass(tell_nodes),
+    ),
+    writes=("x", "v"),
+)
+# Subtracts the mean displacement at particles.
+UNSHIFT = Operation(
+    reads=("x", "v", "C"),
+    passes=(LOCATE, Pass(mean_shift, {"back": ("d",)}), Pass(go_back, MOTION, in_lanes=True)),
+    writes=("x", "v"),
+)
 
 
 @ti.func

@@ -23,17 +23,9 @@ from mpmcli.scene import Scene
 from mpmcli.scene.schema import SolverSettings
 from mpmcli.solver.contact.layers import Layers
 from mpmcli.solver.particles.arrays import MASS, VOLUME
+from mpmcli.solver.particles.loop import INDEX, Operation, Pass, over
 from mpmcli.solver.particles.state_bounds import volume_ratio
-from mpmcli.solver.transfer.lanes import (
-    LANES,
-    load_deformation,
-    load_vectors,
-    matrix_of,
-    repeat_first,
-    vector_of,
-    zero_lanes,
-)
-from mpmcli.solver.transfer.splines import PAD, bounded
+from mpmcli.solver.transfer.splines import PAD
 
 # Lack of volume that is ignored where a collider cuts the kernel, beside what a law ignores. The density of particles
 # there is less even; without it still water rises from inclined faces.
@@ -66,12 +58,12 @@ def cell_of(grid: ti.template(), x: ti.template()):
 
 
 @ti.func
-def cell_of_particle(grid: ti.template(), group: ti.template(), p: int):
-    """Return the linear index of the first node of the cell of a particle in the layer of its body."""
-    cell = cell_of(grid, group.on_grid(p))
+def in_layer(grid: ti.template(), group: ti.template(), p: int, cell: int):
+    """Return the index of a cell in the layer of the body of particle p, given that in layer 0."""
+    index = cell
     if ti.static(group.layers > 1):
-        cell += group.layer_of(p) * ti.static(grid.node_count)
-    return cell
+        index += group.layer_of(p) * ti.static(grid.node_count)
+    return index
 
 
 @ti.func
@@ -83,78 +75,51 @@ def log_volume(H: ti.template()):
 @ti.func
 def earlier_cell(grid: ti.template(), group: ti.template(), p: int, dt: float):
     """Return the linear index of the first node of the cell in which particle p was a step of dt, s, ago."""
-    cell = cell_of(grid, group.x[p] - dt * group.v[p])
-    if ti.static(group.layers > 1):
-        cell += group.layer_of(p) * ti.static(grid.node_count)
-    return cell
+    return in_layer(grid, group, p, cell_of(grid, group.x[p] - dt * group.v[p]))
 
 
 @ti.func
-def average_range(grid: ti.template(), g: ti.template(), group: ti.template(), first: int, last: int, dt: float):
-    """Add particles first to last - 1 of the g-th group to the sums of their cells, which no other thread may write.
-
-    Their growth is added to the cells in which they were in the last step, of dt, s.
-    """
-    d = ti.static(group.dimension)
-    x, deformation = zero_lanes(d), zero_lanes(ti.static(d * d))
-    volumes, logs, cells = ti.Vector.zero(float, LANES), ti.Vector.zero(float, LANES), ti.Vector.zero(int, LANES)
-    begin = first
-    while begin < last:
-        count = ti.min(LANES, last - begin)
-        load_deformation(group, bounded(begin), deformation)
-        load_vectors(x, group.place_on_grid, bounded(begin))
-        if count < LANES:
-            repeat_first(deformation, count)
-            repeat_first(x, count)
-        for lane in range(LANES):
-            # Memory beyond the last particle holds no row number of the table.
-            volumes[lane] = group.row(begin + ti.min(lane, count - 1))[VOLUME]
-        for lane in range(LANES):
-            logs[lane] = log_volume(matrix_of(deformation, 0, d, lane))
-            cells[lane] = cell_of(grid, vector_of(x, 0, d, lane))
-            if ti.static(group.layers > 1):
-                cells[lane] += group.layer_of(begin + ti.min(lane, count - 1)) * ti.static(grid.node_count)
-        for lane in range(count):
-            p, cell = begin + lane, cells[lane]
-            group.cell[p] = cell
-            group.to_mean[p] = logs[lane]
-            grid.means[g][cell] = grid.means[g][cell] + volumes[lane] * ti.Vector([logs[lane], 1.0, 0.0, 0.0])
-            if ti.static(group.evened):
-                before = earlier_cell(grid, group, p, dt)
-                share = volumes[lane] * ti.Vector([0.0, 0.0, group.growth[p], 1.0])
-                grid.means[g][before] = grid.means[g][before] + share
-        begin += LANES
+def measure_volume(at: ti.template(), _p: int, _dt: float, place: ti.template(), deformation: ti.template()):
+    """Return ln J of a particle and its cell in layer 0."""
+    return log_volume(deformation), cell_of(at.grid, place)
 
 
 @ti.func
-def add_volume(grid: ti.template(), g: ti.template(), group: ti.template(), p: int, dt: float):
-    """Add particle p to the sums of its cell, and its growth to that in which it was a step of dt, s, ago; atomics."""
-    H = ti.Matrix.zero(float, group.dimension, group.dimension)
-    for i, j in ti.static(ti.ndrange(group.dimension, group.dimension)):
-        H[i, j] = group.displacement_gradient[p][i, j]
-    own = log_volume(H)
-    group.to_mean[p] = own
-    volume, cell = group.row(p)[VOLUME], cell_of_particle(grid, group, p)
-    group.cell[p] = cell
-    add_to_mean(grid, g, cell, 0, volume, own)
+def add_volume(at: ti.template(), p: int, dt: float, log_J: float, cell: int):
+    """Add a particle to the sums of its cell, and its growth to those of its cell in the last step, of dt, s."""
+    (group,) = ti.static((at.group,))
+    volume, own = group.row(p)[VOLUME], in_layer(at.grid, group, p, cell)
+    group.cell[p], group.to_mean[p] = own, log_J
+    add_to_mean(at, own, 0, volume, log_J)
     if ti.static(group.evened):
-        add_to_mean(grid, g, earlier_cell(grid, group, p, dt), 2, volume, group.growth[p])
+        add_to_mean(at, earlier_cell(at.grid, group, p, dt), 2, volume, group.growth[p])
+
+
+# Adds particles to the sums of their cells, which no other thread may write unless sums are atomic.
+AVERAGE = Operation(
+    reads=("place", "deformation"),
+    passes=(Pass(measure_volume, {"log_J": (), "cell": INDEX}, in_lanes=True), Pass(add_volume)),
+)
 
 
 @ti.func
-def add_to_mean(grid: ti.template(), g: ti.template(), cell: int, first: ti.template(), volume: float, value: float):
+def add_to_mean(at: ti.template(), cell: int, first: ti.template(), volume: float, value: float):
     """Add a value times the volume of a particle, and the volume, to two sums of a cell."""
-    if ti.static(grid.deterministic):
-        grid.fixed.add_mean(g, cell, first, volume, value)
+    if ti.static(at.grid.deterministic):
+        at.grid.fixed.add_mean(at.g, cell, first, volume, value)
+    elif ti.static(at.atomic):
+        ti.atomic_add(at.grid.means[at.g][cell][first], volume * value)
+        ti.atomic_add(at.grid.means[at.g][cell][ti.static(first + 1)], volume)
     else:
-        ti.atomic_add(grid.means[g][cell][first], volume * value)
-        ti.atomic_add(grid.means[g][cell][ti.static(first + 1)], volume)
+        more = ti.Vector.zero(float, 4)
+        more[first], more[ti.static(first + 1)] = value, 1.0
+        at.grid.means[at.g][cell] = at.grid.means[at.g][cell] + volume * more
 
 
 @ti.func
 def clear_mean(grid: ti.template(), g: ti.template(), group: ti.template(), p: int):
     """Set the sums of the cell of particle p and of its periodic images to zero."""
-    cell = cell_of_particle(grid, group, p)
+    cell = in_layer(grid, group, p, cell_of(grid, group.on_grid(p)))
     clear_cell(grid, g, cell)
     if ti.static(len(grid.period.axes) > 0):
         for images in range(1, ti.static(2**grid.dimension)):
@@ -221,13 +186,13 @@ def even(H: ti.template(), missing: float):
 
 
 @ti.func
-def average_for_frame(grid: ti.template(), g: ti.template(), group: ti.template(), first: int, last: int):
+def average_for_frame(at: ti.template(), first: int, last: int):
     """Store `missing_to_mean` of all particles of a run in `to_mean`, on one thread."""
     for p in range(first, last):
-        clear_mean(grid, g, group, p)
-    average_range(grid, g, group, first, last, 0.0)
+        clear_mean(at.grid, at.g, at.group, p)
+    over(at, AVERAGE, first, last, 0.0)
     for p in range(first, last):
-        group.to_mean[p] = missing_to_mean(grid, g, group, p)
+        at.group.to_mean[p] = missing_to_mean(at.grid, at.g, at.group, p)
 
 
 def needs_filling(scene: Scene, laws: Sequence[Law], layers: Layers) -> bool:
