@@ -34,8 +34,9 @@ class Phase:
         adds: whether particles add to nodes; without atomics this is done colour by colour of pencils.
         turns: number of repetitions, with `turn` counting from 0.
         rounds: number of times that all turns are repeated.
-        body: function of one node or particle on any device: body(at, node, kick), or in a shift body(at, node or
-            particle, time over which volumes relax); or an `Operation` on particles (`solver.particles.loop`).
+        body: function of one node or particle on any device: body(at, node, kick), body(at, particle, step), or in a
+            shift body(at, node or particle, time over which volumes relax); or an `Operation` on particles
+            (`solver.particles.loop`).
         wanted: function of the first node of a row on a dense grid on the CPU, which returns whether the row has work:
             wanted(at, node). Such phases have work in layer 0 alone.
         part, item: for phases with a division of work of their own, functions of a part of all items on the CPU,

@@ -11,7 +11,7 @@ of the run again.
 from collections.abc import Callable
 from typing import NamedTuple
 
-from mpmcli.boundaries.feature import Phase
+from mpmcli.boundaries.feature import Phase, changed
 from mpmcli.boundaries.mirror_images import find_friction
 from mpmcli.quick_taichi import ti
 from mpmcli.solver.contact.contact_phases import clear_part
@@ -31,11 +31,11 @@ from mpmcli.solver.particles.sort import (
     stay_rolled,
     take_all,
 )
+from mpmcli.solver.particles.state_bounds import NOTHING
 from mpmcli.solver.transfer.cpu_transfers import (
-    advance_range,
-    advance_tiles,
     nodes_of_blocks,
     nodes_of_rows,
+    over_tiles,
     scatter_pencils,
     scatter_range,
     update_blocks,
@@ -63,6 +63,7 @@ class PartKind(NamedTuple):
         part: function of a part, in place of a method.
         item: function for each node or particle, for methods that only loop.
         wanted: function that tells whether a row of nodes has work, see `Phase`.
+        shifts: whether the phases belong to the shift of particles.
     """
 
     name: str
@@ -73,6 +74,7 @@ class PartKind(NamedTuple):
     part: Callable | None
     item: Callable | None
     wanted: Callable | None
+    shifts: bool
 
 
 class Part(Work):
@@ -91,7 +93,7 @@ class Part(Work):
         """Store a view and variables of a kernel."""
         super().__init__(view, kind.group, kind.item, turn)
         self.region, self.part, self.t, self.frame_buffer = variables
-        self.wanted = kind.wanted
+        self.wanted, self.shifts = kind.wanted, kind.shifts
 
 
 @ti.data_oriented
@@ -284,7 +286,7 @@ class CpuPhases(RunPhases):
         if item:
             body = "each_node" if phase.over == "nodes" else "each_in_pencils" if phase.adds else "each_particle"
             body = "shift_nodes" if body == "each_node" and phase.shifts else body
-        functions = (phase.part, item, phase.wanted) if phase else (None, None, None)
+        functions = (phase.part, item, phase.wanted, phase.shifts) if phase else (None, None, None, False)
         self.kinds += (PartKind(name, group, first, first + length, body, *functions),)
         return first + length
 
@@ -396,7 +398,7 @@ class CpuPhases(RunPhases):
     @ti.func
     def each_in_pencils(self, at: ti.template()):
         """Apply the function of a phase to particles that add to nodes, pencil by pencil."""
-        self.in_pencils(at, at.item, at.step.relaxed)
+        self.in_pencils(at, at.item, self.time_of(at))
 
     @ti.func
     def in_pencils(self, at: ti.template(), op: ti.template(), how: float):
@@ -418,7 +420,7 @@ class CpuPhases(RunPhases):
     def each_particle(self, at: ti.template()):
         """Apply the function of a phase to particles."""
         first, after = self.places.particles_of(at)
-        over(at, at.item, first, after, at.step.relaxed)
+        over(at, at.item, first, after, self.time_of(at))
 
     @ti.func
     def clear(self, at: ti.template()):
@@ -533,15 +535,15 @@ class CpuPhases(RunPhases):
     @ti.func
     def advance(self, at: ti.template()):
         """Gather and move particles of the g-th group."""
-        dt, gravity_step = at.step.dt, self.gravity_of(at.step)
+        dt, gravity_step, rate = at.step.dt, self.gravity_of(at.step), NOTHING
+        (inner, op) = ti.static((changed(at, gravity_step=gravity_step), self.device.advances[at.g]))
         if ti.static(at.grid.sparse):
             first, after = self.places.pencils_of(at)
-            begin, end = at.order.first_tile_of(first), at.order.first_tile_of(after)
-            ti.atomic_max(at.step.rate[at.g], advance_tiles(at, begin, end, dt, gravity_step))
+            rate = over_tiles(inner, op, at.order.first_tile_of(first), at.order.first_tile_of(after), dt)
         else:
             first, after = self.places.particles_of(at)
-            rate = advance_range(at.particles, at.g, self.device.groups[at.g], first, after, dt, gravity_step)
-            ti.atomic_max(at.step.rate[at.g], rate)
+            rate = over(inner, op, first, after, dt)
+        ti.atomic_max(at.step.rate[at.g], rate)
 
     # Sorts and frames.
 

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -15,8 +16,10 @@ from mpmcli.solver.engine.step import step_phases
 from mpmcli.solver.features import Features
 from mpmcli.solver.grid.grid import Grid
 from mpmcli.solver.particles.arrays import ParticleArrays
+from mpmcli.solver.particles.loop import Operation
 from mpmcli.solver.particles.sort import TileOrder
 from mpmcli.solver.particles.state_bounds import NOTHING
+from mpmcli.solver.transfer.advance import advance_of
 from mpmcli.solver.transfer.node_update import NodeUpdate
 from mpmcli.solver.transfer.particle_update import NOT_LOST, ParticleUpdate
 from mpmcli.solver.transfer.splines import PAD
@@ -62,6 +65,11 @@ class Device:
     def particle_count_varies(self) -> bool:
         """Whether particles enter or leave during a run."""
         return self.groups[0].particle_count_varies
+
+    @cached_property
+    def advances(self) -> tuple[Operation, ...]:
+        """G2P of each law."""
+        return tuple(advance_of(group, keeps=self.grid.scheme.keeps_flip_velocity) for group in self.groups)
 
     @property
     def phases(self) -> tuple[Phase, ...]:
@@ -278,6 +286,14 @@ class RunPhases:
                 box[i, a] = self.device.grid.box[run.w * 2 + i, a]
         h, inverse, scale = step.spacing, step.inverse_spacing, step.gradient_scale
         return ti.static((RunView(self.device, run, step, h, inverse, scale, box, last, extent),))
+
+    @ti.func
+    def time_of(self, at: ti.template()):
+        """Return the time that an operation on particles covers, s: the step, or in a shift that since the last one."""
+        time = at.step.dt
+        if ti.static(at.shifts):
+            time = at.step.relaxed
+        return time
 
     @ti.func
     def gravity_of(self, step: ti.template()):

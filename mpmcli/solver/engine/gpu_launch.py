@@ -14,7 +14,7 @@ from collections.abc import Callable
 import numpy as np
 
 from mpmcli.boundaries.doubles import as_double, double_field
-from mpmcli.boundaries.feature import Phase
+from mpmcli.boundaries.feature import Phase, changed
 from mpmcli.boundaries.mirror_images import find_friction
 from mpmcli.quick_taichi import ti
 from mpmcli.solver.drive.forces import HostValues
@@ -69,7 +69,7 @@ class Item(Work):
     def __init__(self, view: RunView, phase: Phase, turn: int, q: object, peaks: Maxima) -> None:
         """Store a view and a variable of a kernel."""
         super().__init__(view, phase.group, phase.body, turn)
-        self.q, self.peaks = q, peaks
+        self.q, self.peaks, self.shifts = q, peaks, phase.shifts
 
 
 @ti.data_oriented
@@ -121,10 +121,10 @@ class GpuPhases(RunPhases):
 
     def body(self, phase: Phase) -> object:
         """Return the method of a phase."""
-        if phase.shifts:
-            return self.shift_node if phase.over == "nodes" else self.shift_particle
+        if phase.body and phase.over == "particles":
+            return self.each_particle
         if phase.body and phase.over == "nodes":
-            return self.each_node
+            return self.shift_node if phase.shifts else self.each_node
         return getattr(self, phase.name)
 
     @ti.func
@@ -166,10 +166,13 @@ class GpuPhases(RunPhases):
             ti.static(at.item)(at, at.grid.box_node(at.q), at.step.relaxed)
 
     @ti.func
-    def shift_particle(self, at: ti.template()):
-        """Apply the function of a phase to a particle in steps that shift particles."""
-        if at.step.relaxed > 0.0:
-            one(at, at.item, at.q, at.step.relaxed)
+    def each_particle(self, at: ti.template()):
+        """Apply the function of a phase to a particle, if it belongs to a shift in steps that shift particles."""
+        if ti.static(at.shifts):
+            if at.step.relaxed > 0.0:
+                one(at, at.item, at.q, at.step.relaxed)
+        else:
+            one(at, at.item, at.q, at.step.dt)
 
     @ti.func
     def clear(self, at: ti.template()):
@@ -281,9 +284,9 @@ class GpuPhases(RunPhases):
     @ti.func
     def advance(self, at: ti.template()):
         """Gather and move a particle."""
-        layer = at.group.layer_of(at.q)
-        (particles,) = ti.static((self.particles_in(at, layer),))
-        rate = particles.advance(at.g, self.device.groups[at.g], at.q, at.step.dt, self.gravity_of(at.step))
+        gravity_step = self.gravity_of(at.step)
+        (own,) = ti.static((changed(at, gravity_step=gravity_step),))
+        rate = one(own, self.device.advances[at.g], at.q, at.step.dt)
         self.peaks.include(at.w, 1 + 2 * at.g, rate)
 
     # Work outside of steps.

@@ -35,12 +35,12 @@ class Column(NamedTuple):
     """What an operation reads or writes of a particle, see `loop`.
 
     Attributes:
-        field: its field.
+        field: its field; None for the row of the table.
         shape: its shape, () for a number.
         entries: the entry of the field for each of its numbers, row by row.
     """
 
-    field: ti.Field
+    field: ti.Field | None
     shape: tuple[int, ...]
     entries: tuple[tuple[int, ...], ...]
 
@@ -191,16 +191,25 @@ class ParticleArrays:
         return view
 
     def column(self, name: str) -> Column:
-        """Return a column: x, v, C, "place", the position on the grid, or "deformation", J - 1 or F - I."""
-        d, square = self.dimension, tuple(np.ndindex(self.dimension, self.dimension))
-        if name in ("x", "v", "place"):
-            field = self.place_on_grid if name == "place" else getattr(self, name)
-            return Column(field, (d,), tuple(np.ndindex(d)))
-        if name == "C":
-            return Column(self.gradient, (d, d), tuple((a, c) for c, a in square))
-        if self.J_minus_1 is None:
-            return Column(self.displacement_gradient, (d, d), square)
-        return Column(self.J_minus_1, (), ((),))
+        """Return the column of a name.
+
+        They are x, "place" (the position on the grid), v, C, "remainder" (of x), "deformation" (J - 1 or F - I),
+        "growth", and "row", the row of the table.
+        """
+        d = self.dimension
+        along, square = tuple(np.ndindex(d)), tuple(np.ndindex(d, d))
+        changes = self.displacement_gradient, (d, d), square
+        found = {
+            "x": (self.x, (d,), along),
+            "place": (self.place_on_grid, (d,), along),
+            "v": (self.v, (d,), along),
+            "C": (self.gradient, (d, d), tuple((a, c) for c, a in square)),
+            "remainder": (self.gradient, (d,), tuple((c, d) for c in range(d))),
+            "deformation": (self.J_minus_1, (), ((),)) if self.displacement_gradient is None else changes,
+            "growth": (self.growth, (), ((),)),
+            "row": (None, (self.table.n,), ()),
+        }
+        return Column(*found[name])
 
     @property
     def state(self) -> tuple[ti.Field, ...]:

@@ -14,14 +14,13 @@ from typing import Any
 
 from mpmcli.quick_taichi import ti
 from mpmcli.solver.particles.sort import stay_rolled
+from mpmcli.solver.particles.state_bounds import NOTHING
 from mpmcli.solver.transfer.lanes import (
     LANES,
     load_entry,
+    load_rows,
     repeat_first,
-    set_matrix,
-    set_vector,
     store_lanes,
-    vector_of,
 )
 from mpmcli.solver.transfer.splines import bounded
 
@@ -39,14 +38,14 @@ class Pass:
     Attributes:
         body: the function; the names of its parameters after the third are those of the values that it takes.
         gives: the values that it returns, in order, with their sizes: numbers, "d" for the dimension, "nodes" for the
-            nodes of a stencil along an axis; a second size is that of the rows of a matrix; () for a number, INDEX or
-            STENCIL for an integer.
+            nodes of a stencil along an axis, "width" for the numbers of a node; a second size is that of the rows of a
+            matrix; () for a number, INDEX or STENCIL for an integer, None for a value of the size of its column.
         in_lanes: whether the body accesses only its values and constants of `at`, and may thus run for a lane without a
             particle.
     """
 
     body: Callable
-    gives: dict[str, tuple] = field(default_factory=dict)
+    gives: dict[str, tuple | None] = field(default_factory=dict)
     in_lanes: bool = False
 
     @property
@@ -60,25 +59,30 @@ class Operation:
     """An operation on the particles of a group.
 
     Attributes:
-        reads: columns of the particles that passes take, see `ParticleArrays.column`.
+        reads: columns of the particles, see `ParticleArrays.column`; passes take zeros for those that are not read.
         passes: what is done, in order.
         writes: columns that take the values with their names at the end.
+        guarded: columns that are written only if the value "sound" of the particle is 1; else it is lost.
+        largest: a value of which the largest is returned.
     """
 
     reads: tuple[str, ...]
     passes: tuple[Pass, ...]
     writes: tuple[str, ...] = ()
+    guarded: tuple[str, ...] = ()
+    largest: str = ""
 
 
 class ParticleValues:
     """The values of one particle by name, variables of a kernel."""
 
     def __init__(self, op: Operation, group: Any, p: Any) -> None:
-        self.values = {name: column_of(group.column(name), p) for name in op.reads}
+        self.group = group
+        self.values = {name: column_of(group, group.column(name), p) for name in op.reads}
 
     def take(self, names: Sequence[str], _lane: Any) -> tuple:
         """Return values of the particle."""
-        return tuple(self.values[name] for name in names)
+        return tuple(self.values[name] if name in self.values else nothing(self.group, name) for name in names)
 
     def give(self, names: Sequence[str], given: tuple, _lane: Any) -> None:
         """Set values of the particle."""
@@ -86,71 +90,117 @@ class ParticleValues:
 
 
 class LaneValues:
-    """The values of LANES particles by name: an array for each, with a row per entry, variables of a kernel."""
+    """The values of LANES particles by name: an array for each, with a row per entry, variables of a kernel.
+
+    Sums over nodes have a row per lane instead, because the numbers of a node are added at once.
+    """
 
     def __init__(self, op: Operation, at: Any) -> None:
-        sizes = {"d": at.grid.dimension, "nodes": at.grid.scheme.spline.nodes}
-        self.shapes = {name: at.group.column(name).shape for name in op.reads}
+        grid, self.group, self.by_lane = at.grid, at.group, set()
+        sizes = {"d": grid.dimension, "nodes": grid.scheme.spline.nodes, "width": grid.width}
+        self.shapes = {name: self.group.column(name).shape for name in op.reads}
         for step in op.passes:
-            self.shapes |= {name: tuple(sizes.get(n, n) for n in shape) for name, shape in step.gives.items()}
-        self.arrays = {name: ti.lang.impl.expr_init(empty(shape)) for name, shape in self.shapes.items()}
+            for name, shape in step.gives.items():
+                self.by_lane |= {name} if "width" in (shape or ()) else set()
+                own = self.group.column(name).shape if shape is None else tuple(sizes.get(n, n) for n in shape)
+                self.shapes[name] = own
+        self.arrays = {
+            name: ti.lang.impl.expr_init(empty(shape, name in self.by_lane)) for name, shape in self.shapes.items()
+        }
 
     def take(self, names: Sequence[str], lane: Any) -> tuple:
         """Return values of a lane."""
-        return tuple(value_of(self.arrays[name], self.shapes[name], lane) for name in names)
+        return tuple(
+            value_of(self.arrays[name], self.shapes[name], lane, name in self.by_lane)
+            if name in self.arrays
+            else nothing(self.group, name)
+            for name in names
+        )
 
     def give(self, names: Sequence[str], given: tuple, lane: Any) -> None:
         """Set values of a lane."""
         for name, value in zip(names, given, strict=True):
-            set_value(self.arrays[name], self.shapes[name], lane, value)
+            set_value(self.arrays[name], self.shapes[name], lane, name in self.by_lane, value)
 
 
-def empty(shape: tuple) -> ti.Matrix:
+def nothing(group: Any, name: str) -> Any:
+    """Return zeros in place of a column that is not read."""
+    shape = group.column(name).shape
+    return ti.Matrix.zero(float, *shape) if shape else 0.0
+
+
+def empty(shape: tuple, by_lane: bool) -> ti.Matrix:
     """Return an array of lanes for values of a shape."""
     if shape in (INDEX, STENCIL):
         return ti.Matrix.zero(int, 1, LANES)
-    return ti.Matrix.zero(float, math.prod(shape), LANES)
+    entries = math.prod(shape)
+    return ti.Matrix.zero(float, *((LANES, entries) if by_lane else (entries, LANES)))
 
 
 @ti.func
-def value_of(lanes: ti.template(), shape: ti.template(), lane: int):
+def value_of(lanes: ti.template(), shape: ti.template(), lane: int, by_lane: ti.template()):
     if ti.static(len(shape) == 2):
         value = ti.Matrix.zero(float, shape[0], shape[1])
         for i, j in ti.static(ti.ndrange(shape[0], shape[1])):
-            value[i, j] = lanes[i * shape[1] + j, lane]
+            value[i, j] = entry_at(lanes, i * shape[1] + j, lane, by_lane)
         return value
     elif ti.static(len(shape) == 1 and shape not in (INDEX, STENCIL)):
-        return vector_of(lanes, 0, ti.static(shape[0]), lane)
+        value = ti.Vector.zero(float, shape[0])
+        for i in ti.static(range(shape[0])):
+            value[i] = entry_at(lanes, i, lane, by_lane)
+        return value
     else:
         return lanes[0, lane]
 
 
 @ti.func
-def set_value(lanes: ti.template(), shape: ti.template(), lane: int, value: ti.template()):
-    if ti.static(len(shape) == 2):
-        set_matrix(lanes, 0, value, lane)
-    elif ti.static(len(shape) == 1 and shape not in (INDEX, STENCIL)):
-        set_vector(lanes, 0, value, lane)
+def entry_at(lanes: ti.template(), k: ti.template(), lane: int, by_lane: ti.template()):
+    if ti.static(by_lane):
+        return lanes[lane, k]
     else:
-        lanes[0, lane] = value
+        return lanes[k, lane]
 
 
 @ti.func
-def column_of(column: ti.template(), p: int):
-    """Return the value of a column of particle p."""
-    field, shape = ti.static((column.field, column.shape))
+def set_value(lanes: ti.template(), shape: ti.template(), lane: int, by_lane: ti.template(), value: ti.template()):
+    if ti.static(len(shape) == 0 or shape in (INDEX, STENCIL)):
+        lanes[0, lane] = value
+    else:
+        for k in ti.static(range(math.prod(shape))):
+            if ti.static(by_lane):
+                lanes[lane, k] = entry_of(value, shape, k)
+            else:
+                lanes[k, lane] = entry_of(value, shape, k)
+
+
+@ti.func
+def entry_of(value: ti.template(), shape: ti.template(), k: ti.template()):
+    """Return entry k, row by row, of a value."""
     if ti.static(len(shape) == 2):
-        value = ti.Matrix.zero(float, shape[0], shape[1])
-        for k in ti.static(range(len(column.entries))):
-            value[k // shape[1], k % shape[1]] = field[p][column.entries[k]]
-        return value
+        return value[k // shape[1], k % shape[1]]
     elif ti.static(len(shape) == 1):
-        value = ti.Vector.zero(float, shape[0])
+        return value[k]
+    else:
+        return value
+
+
+@ti.func
+def column_of(group: ti.template(), column: ti.template(), p: int):
+    """Return the value of a column of particle p."""
+    if ti.static(len(column.entries) == 0):
+        return group.row(p)
+    elif ti.static(len(column.shape) == 2):
+        value = ti.Matrix.zero(float, column.shape[0], column.shape[1])
         for k in ti.static(range(len(column.entries))):
-            value[k] = field[p][column.entries[k]]
+            value[k // column.shape[1], k % column.shape[1]] = column.field[p][column.entries[k]]
+        return value
+    elif ti.static(len(column.shape) == 1):
+        value = ti.Vector.zero(float, column.shape[0])
+        for k in ti.static(range(len(column.entries))):
+            value[k] = column.field[p][column.entries[k]]
         return value
     else:
-        return field[p]
+        return column.field[p]
 
 
 @ti.func
@@ -178,27 +228,32 @@ def carry_out(at: ti.template(), step: ti.template(), p: int, how: float, values
 
 @ti.func
 def one(at: ti.template(), op: ti.template(), p: int, how: float):
-    """Carry out an operation on particle p."""
+    """Carry out an operation on particle p; return its value for `largest`."""
+    most = NOTHING
     if ti.static(isinstance(op, Operation)):
         (values,) = ti.static((ParticleValues(op, at.group, p),))
         for step in ti.static(op.passes):
             carry_out(at, step, p, how, values, 0)
         for name in ti.static(op.writes):
-            (column, value) = ti.static((at.group.column(name), values.values[name]))
-            for k in ti.static(range(len(column.entries))):
-                set_column(column, p, k, entry_of(value, column.shape, k))
+            write_one(ti.static(at.group.column(name)), p, values.values[name])
+        if ti.static(len(op.guarded) > 0):
+            if values.values["sound"] == 1.0:
+                for name in ti.static(op.guarded):
+                    write_one(ti.static(at.group.column(name)), p, values.values[name])
+            else:
+                at.particles.lose(at.g, at.group, p)
+        if ti.static(len(op.largest) > 0):
+            most = values.values[op.largest]
     else:
         ti.static(op)(at, p, how)
+    return most
 
 
 @ti.func
-def entry_of(value: ti.template(), shape: ti.template(), k: ti.template()):
-    if ti.static(len(shape) == 2):
-        return value[k // shape[1], k % shape[1]]
-    elif ti.static(len(shape) == 1):
-        return value[k]
-    else:
-        return value
+def write_one(column: ti.template(), p: int, value: ti.template()):
+    """Set a column of particle p."""
+    for k in ti.static(range(len(column.entries))):
+        set_column(column, p, k, entry_of(value, column.shape, k))
 
 
 def goes_in_lanes(op: Operation | Callable, grid: Any) -> bool:
@@ -210,28 +265,35 @@ def goes_in_lanes(op: Operation | Callable, grid: Any) -> bool:
 
 @ti.func
 def over(at: ti.template(), op: ti.template(), first: int, last: int, how: float):
-    """Carry out an operation on particles first to last - 1, on the CPU."""
+    """Carry out an operation on particles first to last - 1, on the CPU; return the largest value of `largest`."""
+    most = NOTHING
     if ti.static(goes_in_lanes(op, at.grid)):
-        over_lanes(at, op, first, last, how)
+        most = over_lanes(at, op, first, last, how)
     else:
         for p in range(first, last):
             stay_rolled(at.order.buffers.real, p)
             one(at, op, p, how)
+    return most
 
 
 @ti.func
 def over_lanes(at: ti.template(), op: ti.template(), first: int, last: int, how: float):
     """Carry out an operation on particles first to last - 1, LANES at a time."""
     (values,) = ti.static((LaneValues(op, at),))
-    begin = first
+    begin, most = first, NOTHING
+    if ti.static("row" in op.reads and not at.group.many_bodies):
+        load_rows(at.group, first, 1, values.arrays["row"])
     while begin < last:
         count, origin = ti.min(LANES, last - begin), bounded(begin)
         for name in ti.static(op.reads):
-            (column,) = ti.static((at.group.column(name),))
+            (column, lanes) = ti.static((at.group.column(name), values.arrays[name]))
             for k in ti.static(range(len(column.entries))):
-                load_entry(values.arrays[name], k, column.field, ti.static(column.entries[k]), origin)
-            if count < LANES:
-                repeat_first(values.arrays[name], count)
+                load_entry(lanes, k, column.field, ti.static(column.entries[k]), origin)
+            if ti.static(name == "row"):
+                if ti.static(at.group.many_bodies):
+                    load_rows(at.group, begin, count, lanes)
+            elif count < LANES:
+                repeat_first(lanes, count)
         for step in ti.static(op.passes):
             if ti.static(step.in_lanes):
                 for lane in range(LANES):
@@ -240,17 +302,37 @@ def over_lanes(at: ti.template(), op: ti.template(), first: int, last: int, how:
                 for lane in range(count):
                     stay_rolled(at.order.buffers.real, begin + lane)
                     carry_out(at, step, begin + lane, how, values, lane)
-        if count == LANES:
+        sound = count
+        if ti.static(len(op.guarded) > 0):
+            sound = 0
+            for lane in range(count):
+                sound += ti.cast(values.arrays["sound"][0, lane], int)
+        if ti.static(len(op.largest) > 0):
+            for lane in range(count):
+                most = ti.max(most, values.arrays[op.largest][0, lane])
+        if sound == LANES:
             # Entry by entry, so that entries of neighbouring particles are stored at once.
-            for name in ti.static(op.writes):
+            for name in ti.static(op.writes + op.guarded):
                 (column,) = ti.static((at.group.column(name),))
                 for k in ti.static(range(len(column.entries))):
                     store_lanes(column.field, ti.static(column.entries[k]), origin, values.arrays[name], k)
         else:
             for lane in range(count):
                 stay_rolled(at.order.buffers.real, begin + lane)
-                for name in ti.static(op.writes):
-                    (column,) = ti.static((at.group.column(name),))
-                    for k in ti.static(range(len(column.entries))):
-                        set_column(column, begin + lane, k, values.arrays[name][k, lane])
+                write_lane(at, op.writes, values, begin + lane, lane)
+                if ti.static(len(op.guarded) > 0):
+                    if values.arrays["sound"][0, lane] == 1.0:
+                        write_lane(at, op.guarded, values, begin + lane, lane)
+                    else:
+                        at.particles.lose(at.g, at.group, begin + lane)
         begin += LANES
+    return most
+
+
+@ti.func
+def write_lane(at: ti.template(), names: ti.template(), values: ti.template(), p: int, lane: int):
+    """Set columns of particle p from a lane."""
+    for name in ti.static(names):
+        (column,) = ti.static((at.group.column(name),))
+        for k in ti.static(range(len(column.entries))):
+            set_column(column, p, k, values.arrays[name][k, lane])

@@ -5,8 +5,10 @@ particles are scattered and gathered tile by tile in the window of the thread, a
 whole. The sum of a node is therefore a sum over tiles in fixed order, for any number of threads.
 """
 
+from mpmcli.boundaries.feature import changed
 from mpmcli.quick_taichi import ti
-from mpmcli.solver.particles.arrays import CONSTANTS, VOLUME
+from mpmcli.solver.particles.arrays import VOLUME
+from mpmcli.solver.particles.loop import over
 from mpmcli.solver.particles.sort import stay_rolled
 from mpmcli.solver.particles.state_bounds import NOTHING, volume_ratio
 from mpmcli.solver.transfer.lanes import (
@@ -14,7 +16,6 @@ from mpmcli.solver.transfer.lanes import (
     constants_of,
     deformation_of,
     internal_entries,
-    load_deformation,
     load_entry,
     load_lanes,
     load_layers,
@@ -34,11 +35,10 @@ from mpmcli.solver.transfer.lanes import (
     weights_of,
     zero_lanes,
 )
-from mpmcli.solver.transfer.particle_step import Loads, NodeSums, Receiver, Sender, g2p, loads_on, p2g
+from mpmcli.solver.transfer.particle_step import Loads, Sender, loads_on, p2g
 from mpmcli.solver.transfer.particle_update import SMALLEST_J, scatter_volume
 from mpmcli.solver.transfer.splines import bounded
-from mpmcli.solver.transfer.stencils import add_linear, gather_linear
-from mpmcli.solver.transfer.volume import missing_growth
+from mpmcli.solver.transfer.stencils import add_linear
 
 
 @ti.func
@@ -188,157 +188,6 @@ def store_projected(
 
 
 @ti.func
-def advance_range(
-    particles: ti.template(),
-    g: ti.template(),
-    group: ti.template(),
-    first: int,
-    last: int,
-    dt: float,
-    gravity_step: ti.template(),
-):
-    """Gather and move particles first to last - 1 of the g-th group; return their largest rate of deformation, 1/s."""
-    grid, near = ti.static((particles.grid, particles.near))
-    d = ti.static(group.dimension)
-    width = ti.static(grid.width)
-    nodes = ti.static(grid.scheme.spline.nodes)
-    keeps_F = ti.static(group.law.deformation == "F")
-    places, heres = zero_lanes(d), zero_lanes(ti.static(d if group.total else 1))
-    distances, remainders = zero_lanes(d), zero_lanes(d)
-    deformation, after = zero_lanes(ti.static(stored_entries(group))), zero_lanes(ti.static(stored_entries(group)))
-    first_node, behind = ti.Vector.zero(int, LANES), ti.Vector.zero(int, LANES)
-    weights = zero_lanes(ti.static(nodes * d))
-    velocities, moments = ti.Matrix.zero(float, LANES, width), ti.Matrix.zero(float, LANES, ti.static(d * width))
-    # For particles whose body keeps a fraction of its motion.
-    keeps = ti.static(grid.scheme.keeps_flip_velocity)
-    kept = ti.static(grid.kept if keeps else 0)
-    own_speeds, own_affine = zero_lanes(ti.static(d if keeps else 1)), zero_lanes(ti.static(d * d if keeps else 1))
-    shares, missing = ti.Vector.zero(float, LANES), ti.Vector.zero(float, LANES)
-    speeds, gradients, moved = zero_lanes(d), zero_lanes(ti.static(d * d)), zero_lanes(d)
-    beyond, rates, growths = ti.Vector.zero(float, LANES), ti.Vector.zero(float, LANES), zero_lanes(1)
-    rows = zero_lanes(ti.static(group.table.n if group.law.grows_by_constants else CONSTANTS + 1))
-    sharpest = NOTHING
-    if ti.static(group.law.grows_by_constants and not group.many_bodies):
-        load_rows(group, first, 1, rows)
-    begin = first
-    while begin < last:
-        count = ti.min(LANES, last - begin)
-        origin = bounded(begin)
-        load_vectors(places, group.place_on_grid, origin)
-        if ti.static(group.total):
-            load_vectors(heres, group.x, origin)
-        if ti.static(group.carries):
-            for c in ti.static(range(d)):
-                load_entry(remainders, c, group.gradient, (c, d), origin)
-        load_deformation(group, origin, deformation)
-        if ti.static(keeps):
-            load_vectors(own_speeds, group.v, origin)
-            for c, a in ti.static(ti.ndrange(d, d)):
-                load_entry(own_affine, c * d + a, group.gradient, (a, c), origin)
-        if ti.static(group.law.grows_by_constants and group.many_bodies):
-            load_rows(group, begin, count, rows)
-        if count < LANES:
-            repeat_first(places, count)
-            repeat_first(heres, count)
-            repeat_first(deformation, count)
-        load_layers(behind, grid, group, begin, count)
-
-        for lane in range(LANES):
-            base, distance = grid.scheme.spline.stencil(vector_of(places, 0, d, lane), grid.inverse_spacing)
-            first_node[lane] = near.linear_index(base) + behind[lane]
-            w = grid.scheme.spline.weights(distance)
-            for a in ti.static(range(d)):
-                distances[a, lane] = distance[a]
-                for k in ti.static(range(nodes)):
-                    weights[k * d + a, lane] = w[k, a]
-
-        for lane in range(count):
-            if ti.static(group.evened):
-                missing[lane] = missing_growth(grid, g, group, begin + lane, dt)
-            w = weights_of(weights, nodes, d, lane)
-            velocity, moment = gather_linear(near.nodes, near, first_node[lane], w)
-            for c in ti.static(range(width)):
-                velocities[lane, c] = velocity[c]
-                for a in ti.static(range(d)):
-                    moments[lane, a * width + c] = moment[a, c]
-            if ti.static(keeps):
-                shares[lane] = group.kept[group.row_number(begin + lane)]
-
-        for lane in range(LANES):
-            place, remainder = vector_of(places, 0, d, lane), vector_of(remainders, 0, d, lane)
-            if ti.static(group.total):
-                place = vector_of(heres, 0, d, lane)
-            v, C = vector_of(own_speeds, 0, d, lane), matrix_of(own_affine, 0, d, lane)
-            before, constants = deformation_of(group, deformation, lane), constants_of(rows, lane)
-            share, lacking, distance = shares[lane], missing[lane], vector_of(distances, 0, d, lane)
-            velocity, moment = node_values_of(velocities, 0, d, lane), node_rows_of(moments, d, width, 0, d, lane)
-            old_velocity = node_values_of(velocities, kept, d, lane)
-            old_moment = node_rows_of(moments, d, width, kept, d, lane)
-            (own,) = ti.static((Receiver(place, remainder, v, C, before, constants, share, lacking),))
-            (sums,) = ti.static((NodeSums(distance, velocity, moment, old_velocity, old_moment),))
-            v_after, C_after, inside, left, out, state, growth, rate, slope = g2p(
-                particles, group, own, sums, dt, gravity_step
-            )
-            set_vector(speeds, 0, v_after, lane)
-            set_matrix(gradients, 0, C_after.transpose(), lane)
-            set_vector(moved, 0, inside, lane)
-            if ti.static(group.carries):
-                set_vector(remainders, 0, left, lane)
-            set_deformation(group, after, state, lane)
-            beyond[lane], growths[0, lane], rates[lane] = out, growth, rate
-            if ti.static(group.surfaced and group.law.projects):
-                if lane < count:
-                    group.carry_surface(begin + lane, slope, dt)
-
-        # Written so that a NaN is not sound: the particle then does not move, and no later step writes outside the
-        # grid.
-        sound = count
-        for lane in range(count):
-            sound -= ti.cast(beyond[lane] <= 0.5 * grid.spacing, int)
-            sharpest = ti.max(sharpest, rates[lane])
-        if count == LANES and sound == 0:
-            # Entry by entry, so that entries of neighbouring particles are stored at once.
-            for c in ti.static(range(d)):
-                store_lanes(group.x, (c,), origin, moved, c)
-                store_lanes(group.v, (c,), origin, speeds, c)
-                for a in ti.static(range(d)):
-                    store_lanes(group.gradient, (a, c), origin, gradients, a * d + c)
-                if ti.static(group.carries):
-                    store_lanes(group.gradient, (c, d), origin, remainders, c)
-                if ti.static(keeps_F):
-                    for a in ti.static(range(d)):
-                        store_lanes(group.displacement_gradient, (c, a), origin, after, c * d + a)
-            if ti.static(group.evened):
-                store_lanes(group.growth, (), origin, growths, 0)
-            if ti.static(not keeps_F):
-                store_lanes(group.J_minus_1, (), origin, after, 0)
-        else:
-            for lane in range(count):
-                p = begin + lane
-                stay_rolled(particles.lost, p)
-                for c in ti.static(range(d)):
-                    group.v[p][c] = speeds[c, lane]
-                    for a in ti.static(range(d)):
-                        group.gradient[p][a, c] = gradients[a * d + c, lane]
-                    if ti.static(group.carries):
-                        group.gradient[p][c, d] = remainders[c, lane]
-                if ti.static(keeps_F):
-                    for i, j in ti.static(ti.ndrange(d, d)):
-                        group.displacement_gradient[p][i, j] = after[i * d + j, lane]
-                    if ti.static(group.evened):
-                        group.growth[p] = growths[0, lane]
-                else:
-                    group.J_minus_1[p] = after[0, lane]
-                if beyond[lane] <= 0.5 * grid.spacing:
-                    for c in ti.static(range(d)):
-                        group.x[p][c] = moved[c, lane]
-                else:
-                    ti.atomic_min(particles.lost[particles.first_lost + g], p)
-        begin += LANES
-    return sharpest
-
-
-@ti.func
 def scatter_pencils(at: ti.template(), first: int, last: int, kick: float, relaxed: float):
     for r in range(first, last):
         pencil = at.order.pencil_of(at.turn, r)
@@ -364,10 +213,10 @@ def scatter_tiles(at: ti.template(), first: int, after: int, kick: float, relaxe
 
 
 @ti.func
-def advance_tiles(at: ti.template(), first: int, after: int, dt: float, gravity_step: ti.template()):
-    """Gather and move the particles in tiles; return their largest rate of deformation, 1/s."""
+def over_tiles(at: ti.template(), op: ti.template(), first: int, after: int, how: float):
+    """Carry out an operation that reads nodes on the particles in tiles; return the largest value of `largest`."""
     (window,) = ti.static((at.grid.window,))
-    sharpest = NOTHING
+    most = NOTHING
     for tile in range(first, after):
         begin, end = at.order.start[tile], at.order.start[tile + 1]
         if begin < end:
@@ -375,8 +224,9 @@ def advance_tiles(at: ti.template(), first: int, after: int, dt: float, gravity_
             first_node = window.first_of(at.t, place)
             (near,) = ti.static((at.particles.with_nodes(window.seen_from(at.grid, first_node)),))
             window.load(at.grid, at.t, place)
-            sharpest = ti.max(sharpest, advance_range(near, at.g, at.group, begin, end, dt, gravity_step))
-    return sharpest
+            (inner,) = ti.static((changed(at, particles=near),))
+            most = ti.max(most, over(inner, op, begin, end, how))
+    return most
 
 
 @ti.func

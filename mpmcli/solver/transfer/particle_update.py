@@ -12,11 +12,11 @@ from mpmcli.solver.grid.grid import Grid, LinearNodes
 from mpmcli.solver.grid.period import opaque
 from mpmcli.solver.particles.arrays import MASS, VOLUME, ParticleArrays
 from mpmcli.solver.particles.state_bounds import deformation_rate, volume_ratio
-from mpmcli.solver.transfer.particle_step import Loads, NodeSums, Receiver, Sender, g2p, loads_on, p2g
+from mpmcli.solver.transfer.particle_step import Loads, Sender, loads_on, p2g
 from mpmcli.solver.transfer.run_sums import RunSums, move_to
 from mpmcli.solver.transfer.splines import PAD
-from mpmcli.solver.transfer.stencils import add_linear, columns, gather_linear
-from mpmcli.solver.transfer.volume import level_volume, missing_growth, relax_volume
+from mpmcli.solver.transfer.stencils import add_linear
+from mpmcli.solver.transfer.volume import level_volume, relax_volume
 from mpmcli.stability.limits import OVERLAP
 
 
@@ -160,62 +160,6 @@ class ParticleUpdate:
             else:
                 change = relax_volume(group, self.grid, self.last, p, group.x[p], relaxed)
         return change
-
-    @ti.func
-    def advance(self, g: ti.template(), group: ti.template(), p: int, dt: float, gravity_step: ti.template()):
-        """Gather and move one particle; return its rate of deformation, 1/s (see `deformation_rate`)."""
-        d, grid = ti.static((self.dimension, self.grid))
-        x, remainder, share, missing = group.x[p], ti.Vector.zero(float, d), 0.0, 0.0
-        v, C = group.motion(p)
-        if ti.static(group.carries):
-            for c in ti.static(range(d)):
-                remainder[c] = group.gradient[p][c, d]
-        if ti.static(group.evened):
-            missing = missing_growth(grid, g, group, p, dt)
-        if ti.static(grid.scheme.keeps_flip_velocity):
-            share = group.kept[group.row_number(p)]
-        deformation, constants = group.deformation(p), group.constants(p)
-        base, distance = grid.scheme.spline.stencil(group.on_grid(p), grid.inverse_spacing)
-        w = grid.scheme.spline.weights(distance)
-        all_sums, moments = gather_linear(grid.nodes, self.near, self.near.linear_index(base), w)
-        velocity, moment = columns(all_sums, moments, 0, d)
-        kept = ti.static(grid.kept if grid.scheme.keeps_flip_velocity else 0)
-        old_velocity, old_moment = columns(all_sums, moments, kept, d)
-        (own,) = ti.static((Receiver(x, remainder, v, C, deformation, constants, share, missing),))
-        (sums,) = ti.static((NodeSums(distance, velocity, moment, old_velocity, old_moment),))
-        v_after, C_after, inside, left, beyond, after, growth, rate, slope = g2p(
-            self, group, own, sums, dt, gravity_step
-        )
-        for c in ti.static(range(d)):
-            group.v[p][c] = v_after[c]
-            for a in ti.static(range(d)):
-                group.gradient[p][a, c] = C_after[c, a]
-            if ti.static(group.carries):
-                group.gradient[p][c, d] = left[c]
-        if ti.static(group.law.deformation == "F"):
-            for i, j in ti.static(ti.ndrange(d, d)):
-                group.displacement_gradient[p][i, j] = after[i, j]
-        else:
-            group.J_minus_1[p] = after
-        if ti.static(group.evened):
-            group.growth[p] = growth
-        if ti.static(group.surfaced and group.law.projects):
-            group.carry_surface(p, slope, dt)
-
-        # Written so that a NaN is not sound: the particle then does not move, and no later step writes outside the
-        # grid.
-        sound = beyond <= 0.5 * self.grid.spacing
-        if ti.static(self.watches_box and not group.total):
-            base_after, _ = self.grid.scheme.spline.stencil(inside, self.grid.inverse_spacing)
-            for a in ti.static(range(d)):
-                low = self.grid.box[0, a]
-                reach = ti.static(self.grid.scheme.spline.nodes - 1)
-                sound = sound and base_after[a] >= low and base_after[a] + reach < low + self.grid.box[1, a]
-        for c in ti.static(range(d)):
-            group.x[p][c] = ti.select(sound, inside[c], x[c])
-        if not sound:
-            self.lose(g, group, p)
-        return rate
 
     @ti.func
     def lose(self, g: ti.template(), group: ti.template(), p: int):

@@ -232,7 +232,7 @@ def go_back(
 
 
 LOCATE = Pass(locate, {"first": STENCIL, "w": ("nodes", "d")}, in_lanes=True)
-MOTION = {"x": ("d",), "v": ("d",)}
+MOTION = {"x": None, "v": None}
 # Moves particles down the gradient of the crowding; nodes take the mean of this motion.
 SHIFT = Operation(
     reads=("x", "v", "C"),
