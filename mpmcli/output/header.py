@@ -20,7 +20,7 @@ from mpmcli.scene.quantity import AXES
 from mpmcli.scene.sampling import rest_volume
 from mpmcli.scene.schema import SolverSettings, usual_particles_per_cell
 from mpmcli.scene.shapes import BodyShape
-from mpmcli.scene.sheets import sheets_of
+from mpmcli.scene.sheets import sheets_in
 from mpmcli.stability.transfer_factors import FARTHEST, INTERVAL
 
 # Times of a run at which gravity is evaluated for its mean.
@@ -228,7 +228,7 @@ class RunHeader:
         chosen = [
             sorted({*type(one).model_fields} - one.model_fields_set) for one in (b.material for b in scene.sources)
         ]
-        emitted = [sheets_of(emitter, scene) for emitter in scene.emitters]
+        emitted = sheets_in(scene)
         return cls.read(
             {
                 "version": __version__,
