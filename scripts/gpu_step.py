@@ -15,7 +15,7 @@ from mpmcli.materials.registry import parameter_models
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import BodyParticles, Scene, load_scene, parse_scene, sample_bodies
 from mpmcli.solver.engine.batch import Batch
-from mpmcli.solver.engine.compiled_kind import CompiledKind
+from mpmcli.solver.engine.resolved import Resolved
 from mpmcli.solver.engine.run import Run, frames_of_all
 from mpmcli.solver.machine.backend import choose_backend, start
 
@@ -48,7 +48,7 @@ def measured(options: argparse.Namespace) -> dict:
     backend = start(choose_backend(options.arch, 1, compile_cache=False, optimisation=options.optimisation))
     scene, particles = scene_of(options)
     particles = particles or sample_bodies(scene)
-    batch = Batch(CompiledKind.of(scene, particles).padded(), backend, options.runs)
+    batch = Batch(Resolved(scene, particles).kind.padded(), backend, options.runs)
     runs = {slot: Run(batch, slot, scene, particles, force=True) for slot in range(options.runs)}
     call, spent, marks, profiled = batch.gpu._call, [0.0], [], os.environ.get("TI_KERNEL_PROFILER") == "1"
 

@@ -10,7 +10,7 @@ from mpmcli.check.facts import SceneFacts
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.scene import BodyParticles, Scene
 from mpmcli.solver.engine.batch import Batch
-from mpmcli.solver.engine.compiled_kind import CompiledKind
+from mpmcli.solver.engine.resolved import Resolved
 from mpmcli.solver.engine.run import Run, frames_of_all
 from mpmcli.solver.machine.backend import Backend
 
@@ -47,7 +47,7 @@ def let_go(
 ) -> list[Outcome]:
     """Run `starts` starts of `count` particles for about `steps` default steps, moving by up to three cells."""
     asked = [_asked(material, *start_of(count, k, sizes), steps) for k in range(starts)]
-    batch = Batch(CompiledKind.of(*asked[0]), backend, starts)
+    batch = Batch(Resolved(*asked[0]).kind, backend, starts)
     runs = {k: Run(batch, k, scene, particles) for k, (scene, particles) in enumerate(asked)}
     rows: list[list[LedgerRow]] = [[] for _ in asked]
     stopped = [""] * starts

@@ -15,6 +15,7 @@ from mpmcli.solver.engine import batch, kernel_store
 from mpmcli.solver.engine.batch import Batch
 from mpmcli.solver.engine.compiled_kind import CompiledKind
 from mpmcli.solver.engine.plan import make_plan
+from mpmcli.solver.engine.resolved import Resolved
 from mpmcli.solver.engine.run import Run, build_run, frames_of_all
 from mpmcli.solver.features import Features
 
@@ -97,7 +98,7 @@ def test_a_drag_slows_all_that_flies_and_goes_on_after_a_pause(
 
 def test_runs_of_a_batch_have_drags_of_their_own(backend_of: Callable) -> None:
     scenes = [flying(rate, frames=2) for rate in (RATE, 3 * RATE)]
-    together = Batch(CompiledKind.of(scenes[0]), backend_of("f64", 1), len(scenes))
+    together = Batch(Resolved(scenes[0]).kind, backend_of("f64", 1), len(scenes))
     ends = {}
     for slot, event in frames_of_all({slot: Run(together, slot, scene) for slot, scene in enumerate(scenes)}):
         if event is not None:

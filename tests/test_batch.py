@@ -11,10 +11,11 @@ from mpmcli.errors import MpmcliError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.materials.registry import parameter_models
-from mpmcli.scene import Scene, parse_scene, sample_bodies
+from mpmcli.scene import Scene, parse_scene
 from mpmcli.solver.engine import run as engine_run
 from mpmcli.solver.engine.batch import Batch
 from mpmcli.solver.engine.compiled_kind import CompiledKind
+from mpmcli.solver.engine.resolved import Resolved
 from mpmcli.solver.engine.run import Run, build_run, frames_of_all
 from mpmcli.solver.frames.diagnosis import UnstableRunError
 
@@ -161,7 +162,7 @@ def scene_named(name: str, other: bool = False) -> Scene:
 
 def batch_of(scenes: Sequence[Scene], backend: object) -> Batch:
     """Return a batch with room for one run of each scene."""
-    kinds = [CompiledKind.of(scene, sample_bodies(scene)) for scene in scenes]
+    kinds = [Resolved(scene).kind for scene in scenes]
     kind = kinds[0]
     for more in kinds[1:]:
         kind = kind.joined(more)
@@ -279,9 +280,9 @@ def test_an_unstable_run_stops_alone(backend_of: Callable) -> None:
 def test_what_is_compiled_decides_on_the_kind() -> None:
     def kind_of(name: str, **changes: object) -> CompiledKind:
         scene = scene_named(name).model_copy(update=changes)
-        return CompiledKind.of(scene, sample_bodies(scene))
+        return Resolved(scene).kind
 
-    wide = kind_of("sand").joined(CompiledKind.of(other := scene_named("sand", other=True), sample_bodies(other)))
+    wide = kind_of("sand").joined(Resolved(scene_named("sand", other=True)).kind)
     assert wide.cells == (20, 20)
     assert wide.particles == kind_of("sand").particles
     assert kind_of("sand").joined(kind_of("fluid")) is None
@@ -297,10 +298,10 @@ def test_kinds_are_equal_where_flags_are() -> None:
 
     def kind_with(material: object) -> CompiledKind:
         scene = fluid.model_copy(update={"bodies": (fluid.bodies[0].model_copy(update={"material": material}),)})
-        return CompiledKind.of(scene, sample_bodies(scene))
+        return Resolved(scene).kind
 
-    assert kind_with(thin).joined(CompiledKind.of(fluid, sample_bodies(fluid))) is not None
-    assert kind_with(dry).joined(CompiledKind.of(fluid, sample_bodies(fluid))) is None
+    assert kind_with(thin).joined(Resolved(fluid).kind) is not None
+    assert kind_with(dry).joined(Resolved(fluid).kind) is None
 
 
 def test_frames_stop_on_request(backend_of: Callable, monkeypatch: pytest.MonkeyPatch) -> None:

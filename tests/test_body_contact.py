@@ -18,9 +18,9 @@ from mpmcli.scene.contact_table import ContactTable
 from mpmcli.scene.forces import Contact
 from mpmcli.solver.contact.layers import STICKS, Layers
 from mpmcli.solver.contact.surfaces import rest_surface
-from mpmcli.solver.engine.compiled_kind import CompiledKind
 from mpmcli.solver.engine.plan import make_plan
 from mpmcli.solver.engine.refusals import require_possible
+from mpmcli.solver.engine.resolved import Resolved
 from mpmcli.solver.engine.run import build_run
 from mpmcli.solver.machine.backend import Backend
 from mpmcli.validation.case import Setting
@@ -100,7 +100,7 @@ def test_elastic_bodies_separate_unless_they_meet_nothing_or_the_solver_has_one_
     ):
         asked = scene([a, b], contact={}, **tables)
         assert ContactTable(asked).one_field == reason and not Layers.of(asked).separate
-        require_possible(asked, Backend("cpu", 1, "f32", False))
+        require_possible(Resolved(asked), Backend("cpu", 1, "f32", False))
 
 
 def test_the_plan_counts_layers() -> None:
@@ -114,7 +114,7 @@ def test_the_plan_counts_layers() -> None:
     water = body("water", [2, 12], [12, 14], material={"law": "fluid", "density": DENSITY, "bulk_modulus": 1e5})
     for contact_, keeps in ((SEPARATE, True), ({"default": "stick"}, False)):
         mixed = scene([body("a", [2, 2], [12, 8]), body("b", [20, 2], [30, 8]), water], contact=contact_)
-        assert CompiledKind.of(mixed, sample_bodies(mixed)).keeps_filling is keeps
+        assert Resolved(mixed).kind.keeps_filling is keeps
 
 
 def test_pairs_do_what_they_say() -> None:
@@ -176,7 +176,7 @@ def test_pairs_that_cannot_be_are_one_sentence(pairs: list, said: str) -> None:
 def test_what_has_one_velocity_field_is_refused(tables: dict, arch: str, reason: str) -> None:
     two = scene([body("a", [2, 2], [8, 8]), body("b", [12, 2], [18, 8])], **tables)
     with pytest.raises(InputError, match=f"separating bodies are not available {reason}; change this, or set "):
-        require_possible(two, Backend(arch, 1, "f32", False))
+        require_possible(Resolved(two), Backend(arch, 1, "f32", False))
 
 
 # The exchange at nodes.

@@ -6,9 +6,8 @@ import pytest
 from random_drives import LAWS, random_scene
 
 from mpmcli.check.facts import SceneFacts
-from mpmcli.scene import sample_bodies
 from mpmcli.solver.engine.batch import Batch
-from mpmcli.solver.engine.compiled_kind import CompiledKind
+from mpmcli.solver.engine.resolved import Resolved
 from mpmcli.solver.engine.run import Run, build_run, frames_of_all
 
 # The predicted step may be this much larger than the smallest one taken.
@@ -21,7 +20,7 @@ def test_safe_throughout_is_not_optimistic(backend_of: Callable) -> None:
     scenes = [scene for scene in scenes if scene.bodies[0].deformation is not None]
     # Walls of one kind, so that one kernel does.
     scenes = [scene for scene in scenes if scene.domain.walls == scenes[0].domain.walls][:5]
-    kinds = [CompiledKind.of(scene, sample_bodies(scene)) for scene in scenes]
+    kinds = [Resolved(scene).kind for scene in scenes]
     kind = kinds[0]
     for more in kinds[1:]:
         kind = kind.joined(more)

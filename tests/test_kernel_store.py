@@ -17,9 +17,10 @@ from conftest import ROOT
 from solver_state import scene_of
 
 from mpmcli.materials import fluid
-from mpmcli.scene import Scene, sample_bodies
+from mpmcli.scene import Scene
 from mpmcli.solver.engine import batch, kernel_store
 from mpmcli.solver.engine.compiled_kind import CompiledKind
+from mpmcli.solver.engine.resolved import Resolved
 from mpmcli.solver.engine.run import build_run
 from mpmcli.solver.machine.backend import Backend, choose_backend, start, stop_backend
 
@@ -186,7 +187,7 @@ def test_the_key_has_all_that_a_kernel_is_made_from(folder: Path, monkeypatch: p
         for _ in range(before):
             build_run(drop(), backend)
         run = build_run(scene, backend)
-        kind = CompiledKind.of(scene, sample_bodies(scene)).padded()
+        kind = Resolved(scene).kind.padded()
         assert kind == run.batch.kind
         found = kernel_store.kernel_key(kind, backend, runs, sources)
         stop_backend()
@@ -323,7 +324,7 @@ def test_prose_is_docstrings_and_comments() -> None:
 def test_what_is_not_known_is_not_stored(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Laws from elsewhere, another version of Taichi, modules that are younger than the process, no cache."""
     scene = drop()
-    kind = CompiledKind.of(scene, sample_bodies(scene))
+    kind = Resolved(scene).kind
     backend = choose_backend("cpu", 1, "f32")
 
     def may_store(kind: CompiledKind = kind, backend: Backend = backend) -> bool:

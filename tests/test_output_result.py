@@ -4,11 +4,13 @@ import h5py
 import numpy as np
 import pytest
 from changed_result import changed
+from made_result import made_header
 from test_output_frames import FIELDS, make_frame
 from test_output_segments import fill
 
 from mpmcli.errors import InputError
 from mpmcli.output import open_result
+from mpmcli.output.header import RunHeader
 from mpmcli.output.layout import sealed_segments
 
 
@@ -55,6 +57,22 @@ def test_a_file_that_contradicts_itself_is_damaged(tmp_path):
         del f["VTKHDF/Steps"]
     with pytest.raises(InputError, match="is damaged"):
         open_result(tmp_path / "run")
+
+
+def test_a_header_of_another_version_is_read():
+    """Keys that no scene has are left out, and missing ones unknown: what was not stored is not today's default."""
+    made = made_header(2)
+    plain = RunHeader.read(made)
+    assert (plain.faces, plain.sticking, plain.shifts, plain.keeps_spin, plain.drops) == ((), None, False, True, False)
+    more = '[domain]\nolder = 1\nwalls = {y_min = "stick"}\nfriction = {x_max = 0.5}\n[solver]\ntransfer = "older"\n'
+    other = RunHeader.read({**made, "older": 2, "scene": made["scene"].replace("[domain]\n", more + "[older]\n")})
+    assert other.faces == (("separate", "separate"), ("stick", "separate")) and other.sticking == (True, True)
+    assert (other.keeps_spin, other.gravity, other.friction.x_max) == (False, None, 0.5)
+    timed = made["scene"].replace("-9.81", '"-9.81 * t"')
+    header = RunHeader.read({**made, "scene": timed})
+    assert header.driven and header.gravity is None and header.mean_gravity == pytest.approx([0, -9.81 * 0.1 / 2])
+    with pytest.raises(ValueError, match=r"number|expression"):
+        RunHeader.read({**made, "scene": made["scene"].replace("-9.81", "true")})
 
 
 def test_frames_packed_under_a_reader_are_read_on(tmp_path):

@@ -14,10 +14,10 @@ from mpmcli.errors import InputError
 from mpmcli.materials.registry import laws, parameter_models
 from mpmcli.output import SegmentStore
 from mpmcli.quick_taichi import ti
-from mpmcli.scene import Scene, load_scene
+from mpmcli.scene import Scene, load_scene, sample_bodies, sampling
 from mpmcli.solver.engine.batch import Batch
-from mpmcli.solver.engine.compiled_kind import CompiledKind
 from mpmcli.solver.engine.plan import LawPlan, Plan, make_plan, require_memory
+from mpmcli.solver.engine.resolved import Resolved
 from mpmcli.solver.engine.run import build_run
 from mpmcli.solver.machine.backend import Backend, choose_backend, has_cuda_device, start, stop_backend
 
@@ -49,12 +49,31 @@ def test_the_plan_is_what_taichi_allocates(backend_of: Callable, name: str, solv
     scene = scene.model_copy(update={"solver": scene.solver.model_copy(update=solver)})
     backend = backend_of(scene.solver.precision, 2)
     plan = make_plan(scene, backend)
-    Batch(CompiledKind.of(scene).padded(), backend)
+    Batch(Resolved(scene).kind.padded(), backend)
     runtime = ti.lang.impl.get_runtime()
     runtime.materialize()
     trees = range(runtime.prog.get_snode_tree_size())
     sizes = [runtime.prog.get_snode_root(k).cell_size_bytes for k in trees]
     assert plan.device_bytes == pytest.approx(sum(sizes), abs=8 * len(sizes) + 8)
+
+
+def test_particles_that_the_plan_counts_are_found_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their positions go to the run, and are not kept; only those of MOST_COUNTED particles are until then."""
+    scene = load_scene(CONFIGS / "mixed_2d.toml", laws=parameter_models()).scene
+    expected, searched, find = sample_bodies(scene), [], sampling.particle_places
+    monkeypatch.setattr(sampling, "particle_places", lambda body, *how: searched.append(body.name) or find(body, *how))
+    asked = Resolved(scene)
+    assert sum(asked.kind.particles) == sum(body.count for body in expected)
+    found = asked.sampled()
+    assert searched == [body.name for body in scene.bodies] and not asked._places
+    assert found.sampled() is found and found.kind == asked.kind
+    for one, same in zip(found.particles, expected, strict=True):
+        assert (one.position == same.position).all() and (one.velocity == same.velocity).all()
+    # The positions of all are more than is kept.
+    places: dict = {}
+    monkeypatch.setattr(sampling, "MOST_COUNTED", max(body.count for body in expected))
+    counts = sampling.count_sources(scene, places)
+    assert counts == [body.count for body in expected] and sum(map(len, places.values())) <= sampling.MOST_COUNTED
 
 
 @pytest.mark.parametrize("dimension", [2, 3])

@@ -10,9 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from solver_state import scene_of
 
-from mpmcli.scene import sample_bodies
 from mpmcli.solver.engine import kernel_store
-from mpmcli.solver.engine.compiled_kind import CompiledKind
+from mpmcli.solver.engine.resolved import Resolved
 from mpmcli.solver.engine.run import build_run
 from mpmcli.solver.machine.backend import choose_backend, start, stop_backend
 from mpmcli.solver.machine.costs import FEWEST, in_steps, padded_cells, power_of_two
@@ -141,6 +140,6 @@ def test_edits_of_a_scene_compile_nothing(tmp_path: Path, monkeypatch: pytest.Mo
 
 def test_a_larger_kind_is_roomy_itself() -> None:
     scene = scene_of(**SCENE)
-    kind = CompiledKind.of(scene, sample_bodies(scene)).padded()
+    kind = Resolved(scene).kind.padded()
     assert kind.padded() == kind
-    assert kind.joined(CompiledKind.of(scene, sample_bodies(scene))) == kind
+    assert kind.joined(Resolved(scene).kind) == kind

@@ -98,7 +98,7 @@ def test_mass_and_count_are_exact_and_the_estimate_close(name, way):
     assert particles.count * particles.volume == pytest.approx(form.volume, rel=1e-12)
     assert particles.count * particles.mass == pytest.approx(800 * form.volume, rel=1e-12)
     assert abs(particles.count - estimate_particles(scene)) < 0.05 * particles.count
-    assert sampling.count_particles(scene) == particles.count
+    assert sum(sampling.count_sources(scene)) == particles.count
 
 
 def test_a_disc_on_a_lattice_is_symmetric():

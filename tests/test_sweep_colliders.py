@@ -9,10 +9,10 @@ from good_sweep import BASE, LAWS, refusal, sweep_of
 from test_placement import assert_well_placed, solids_of
 
 from mpmcli.dataset.draw import draw, room_before
-from mpmcli.scene import Scene, sample_bodies
+from mpmcli.scene import Scene
 from mpmcli.scene.colliders import Collider
 from mpmcli.simulation.runner import Runner
-from mpmcli.solver.engine.compiled_kind import CompiledKind
+from mpmcli.solver.engine.resolved import Resolved
 
 COLLIDERS = """\
 [[colliders]]
@@ -146,7 +146,7 @@ def scenes_by_count() -> dict[int, Scene]:
 
 def test_numbers_and_places_of_colliders_make_one_kind() -> None:
     scenes = scenes_by_count()
-    kinds = {count: CompiledKind.of(scene, sample_bodies(scene)) for count, scene in scenes.items()}
+    kinds = {count: Resolved(scene).kind for count, scene in scenes.items()}
     joined = kinds[1].joined(kinds[4])
     assert joined is not None and joined.colliders == kinds[4].colliders
     assert kinds[4].joined(kinds[2]) == kinds[4].joined(kinds[1])

@@ -8,7 +8,7 @@ import numpy as np
 from mpmcli.bench.cases import BULK_MODULUS, CORNER, DENSITY, EDGE, GRAVITY, BenchCase
 from mpmcli.errors import RunError
 from mpmcli.materials.registry import laws, parameter_models
-from mpmcli.scene import BodyParticles, estimate_particles, parse_scene, sample_bodies
+from mpmcli.scene import BodyParticles, estimate_particles, parse_scene
 from mpmcli.scene.material import Knob, MaterialParameters
 
 # Relative error of a step that results from dividing an interval into equal steps.
@@ -93,7 +93,7 @@ class Ours:
     def __init__(self, data: dict, particles: list[BodyParticles] | None, threads: int, arch: str = "cpu") -> None:
         """Build the scene on the device; `particles`, one entry per body, replace the sampling of the scene."""
         from mpmcli.solver.engine.batch import Batch
-        from mpmcli.solver.engine.compiled_kind import CompiledKind
+        from mpmcli.solver.engine.resolved import Resolved
         from mpmcli.solver.engine.run import Run
         from mpmcli.solver.machine.backend import choose_backend, start
         from mpmcli.solver.machine.costs import useful_threads
@@ -104,11 +104,11 @@ class Ours:
             count = particles[0].count if particles else estimate_particles(scene)
             backend = replace(backend, threads=useful_threads(count, threads))
         start(backend)
-        bodies = particles or sample_bodies(scene)
         # Compile for automatic steps: with the short steps of a benchmark the kernels would keep motion.
         usual = scene.model_copy(update={"time": scene.time.model_copy(update={"step": "auto"})})
-        batch = Batch(CompiledKind.of(usual, bodies).padded(), backend)
-        self.run = Run(batch, 0, scene, bodies, force=particles is not None)
+        asked = Resolved(usual, particles).sampled()
+        batch = Batch(asked.kind.padded(), backend)
+        self.run = Run(batch, 0, scene, asked.particles, force=particles is not None)
         self.threads, self.particles = backend.threads, self.run.particle_count
         self.step = self._smallest = data["time"]["step"]
 

@@ -20,6 +20,7 @@ from mpmcli.plain_text import size_text
 from mpmcli.scene import LoadedScene, Scene, scene_to_toml
 from mpmcli.scene.schema import SolverSettings
 from mpmcli.solver.engine.plan import Plan, make_plan, require_memory
+from mpmcli.solver.engine.resolved import Resolved
 from mpmcli.solver.engine.run import backend_for, build_run
 from mpmcli.solver.frames.builder import POSITION_ERROR
 from mpmcli.solver.frames.diagnosis import UnstableRunError
@@ -71,12 +72,13 @@ class Probe:
 def probe_scene(loaded: LoadedScene, steps: int, *, threads: int | None = None) -> tuple[Probe, Plan]:
     """Run a scene for SECONDS of its `steps`; return cost and plan. InputError: no backend, or little memory."""
     scene = loaded.scene
+    asked = Resolved(scene)
     began = time.perf_counter()
-    backend = backend_for(scene, lambda: steps, "auto", threads)
+    backend = backend_for(asked, lambda: steps, "auto", threads)
     start(backend)
-    plan = make_plan(scene, backend)
+    plan = make_plan(asked, backend)
     require_memory(plan)
-    run = build_run(scene, backend)
+    run = build_run(asked, backend)
     started = time.perf_counter() - began
     run.begin()
     run.frame()

@@ -273,12 +273,11 @@ def _along(u: np.ndarray, n: np.ndarray) -> np.ndarray:
 
 def _obstacles(header: RunHeader, colliders: tuple[Collider, ...]) -> list[_Obstacle]:
     """Return the walls, and the colliders at rest."""
-    friction = header.scene.domain.friction
-    friction = friction if isinstance(friction, dict) else {"default": friction}
-    found = []
+    found, friction = [], header.friction
     for a, words in enumerate(header.faces):
         for word, end, corner, side in zip(words, ("min", "max"), (header.origin, header.upper), (1, -1), strict=True):
-            mu = np.inf if word in STICKING else friction.get(f"{AXES[a]}_{end}", friction.get("default", 0.0))
+            own = getattr(friction, f"{AXES[a]}_{end}")
+            mu = np.inf if word in STICKING else friction.default if own is None else own
             distance = lambda x, a=a, corner=corner, side=side: side * (x[:, a] - corner[a])  # noqa: E731
             found += [_Obstacle(f"{AXES[a]}_{end}", mu, distance)] * (word not in PASSED)
     for one in colliders:

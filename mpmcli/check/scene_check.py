@@ -106,6 +106,7 @@ class SceneCheck:
 def check_scene(
     loaded: LoadedScene,
     *,
+    facts: SceneFacts | None = None,
     plan: Plan | None = None,
     probe: Probe | None = None,
     directory: Path = Path(),
@@ -113,11 +114,12 @@ def check_scene(
 ) -> SceneCheck:
     """Check a scene, without Taichi; the plan is by default that of the CPU, the probe measures the cost of a step.
 
-    `directory` is the place of results, `threads` those of the run: None for as many as the scene can use.
+    `facts` are those of the scene, `directory` is the place of results, `threads` those of the run: None for as many as
+    the scene can use.
     InputError: no step is stable, or more than MOST_STEPS are needed.
     """
     scene = loaded.scene
-    facts = SceneFacts(scene)
+    facts = facts or SceneFacts(scene)
     if not scene.time.end <= MOST_STEPS * facts.taken(facts.step):
         raise InputError(
             f"{loaded.source}: no run is possible: with speeds up to {facts.bounds.speed:.3g} m/s and accelerations up "

@@ -43,7 +43,7 @@ def check_command(
             from mpmcli.check.forecast import probe_scene
 
             found, plan = probe_scene(loaded, check.forecast.steps, threads=threads)
-            check = check_scene(loaded, plan=plan, probe=found, threads=threads)
+            check = check_scene(loaded, facts=check.facts, plan=plan, probe=found, threads=threads)
     else:
         given = {"--set": overrides, "--plugin": plugins, "--probe": probe, "--threads": threads}
         for option in (option for option, value in given.items() if value):

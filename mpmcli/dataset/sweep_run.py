@@ -45,7 +45,7 @@ from mpmcli.output.durable import SPACE_MARGIN, remove_numbered, write_text
 from mpmcli.output.lock import LOCK, refuse_locked, take_lock
 from mpmcli.plain_text import counted, duration_text, size_text, text_table
 from mpmcli.scene import Scene, estimate_particles
-from mpmcli.scene.sampling import count_particles
+from mpmcli.scene.sampling import count_sources
 from mpmcli.simulation.engine import Arch
 
 # Trajectories from which the size of all is estimated.
@@ -506,7 +506,7 @@ def rehearse(sweep: Sweep, settings: SweepSettings) -> Rehearsal:
             drawn = draw(sweep, number)
             values = drawn.values
             loaded = drawn.scene(laws)
-            fault, particles = scene_fault(loaded), count_particles(loaded.scene)
+            fault, particles = scene_fault(loaded), sum(count_sources(loaded.scene))
             steps = expected_steps(SceneFacts(loaded.scene))
             seconds = 0.0 if fault else seconds_of_one(loaded.scene, steps)
             counts = particles, steps, trajectory_bytes(loaded.scene, particles), seconds

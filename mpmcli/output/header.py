@@ -3,7 +3,7 @@
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -13,20 +13,18 @@ from mpmcli import __version__
 from mpmcli.scene import Scene
 from mpmcli.scene.colliders import Collider, ColliderShape
 from mpmcli.scene.contact_table import ContactTable
-from mpmcli.scene.domain import OPEN, PERIODIC, STICKING, Walls
-from mpmcli.scene.entry import TimeVector, definitions, value_of
+from mpmcli.scene.domain import OPEN, PERIODIC, STICKING, Friction
+from mpmcli.scene.entry import Entry, definitions, value_of, varies
 from mpmcli.scene.mesh import ClosedSurface, Mesh
 from mpmcli.scene.quantity import AXES
 from mpmcli.scene.sampling import rest_volume
-from mpmcli.scene.schema import SolverSettings, usual_particles_per_cell
+from mpmcli.scene.schema import usual_particles_per_cell
 from mpmcli.scene.shapes import BodyShape
-from mpmcli.scene.sheets import sheets_of
+from mpmcli.scene.sheets import sheets_in
 from mpmcli.stability.transfer_factors import FARTHEST, INTERVAL
 
 # Times of a run at which gravity is evaluated for its mean.
 MOMENTS = 1001
-_GRAVITY = TypeAdapter(TimeVector)
-_DEFAULTS = {name: field.default for name, field in SolverSettings.model_fields.items()}
 
 
 def nearest_image(way: np.ndarray, period: np.ndarray) -> np.ndarray:
@@ -41,35 +39,6 @@ class _Facts(BaseModel):
     """Entries of a file; other entries are ignored, and missing ones are unknown."""
 
     model_config = ConfigDict(frozen=True)
-
-
-class _Domain(_Facts):
-    gravity: tuple[float | str, ...] = ()
-    walls: dict[str, str] | str | None = None
-    wall_velocity: dict[str, Any] = {}
-    friction: dict[str, float] | float = 0.0
-
-    def faces(self, d: int) -> tuple[tuple[str, str], ...]:
-        """Return the conditions of the faces along each axis; empty if the walls are unknown."""
-        if self.walls is None:
-            return ()
-        table = self.walls if isinstance(self.walls, dict) else {"default": self.walls}
-        return Walls.model_validate(table, context={"dimension": d}).faces(d)
-
-
-class _Time(_Facts):
-    end: float | None = None
-    frames: int | None = None
-
-
-class _Solver(_Facts):
-    transfer: str = _DEFAULTS["transfer"]
-    solids: str = _DEFAULTS["solids"]
-    redistribute: str | bool = False
-
-
-class _Output(_Facts):
-    drop_retired: bool = False
 
 
 class _Contact(_Facts):
@@ -92,12 +61,12 @@ class _Body(_Facts):
 
 
 class _StoredScene(_Facts):
-    """The entries of a complete scene that are read; the file of a shape may be gone."""
+    """The tables of a complete scene, whose keys `entry` reads; the file of a shape may be gone."""
 
-    domain: _Domain = _Domain()
-    time: _Time = _Time()
-    solver: _Solver = _Solver()
-    output: _Output = _Output()
+    domain: dict[str, Any] = {}
+    time: dict[str, Any] = {}
+    solver: dict[str, Any] = {}
+    output: dict[str, Any] = {}
     contact: _Contact = _Contact()
     constants: dict[str, Any] = {}
     bodies: tuple[_Body, ...] = ()
@@ -105,6 +74,19 @@ class _StoredScene(_Facts):
     colliders: tuple[dict[str, Any], ...] = ()
     forces: tuple[Any, ...] = ()
     impulses: tuple[Any, ...] = ()
+
+    def entry(self, table: str, key: str, missing: Any = None) -> Any:
+        """Return a value as a scene reads it; ValidationError: its type is wrong."""
+        if key not in getattr(self, table):
+            return missing
+        context = {"dimension": None, "constants": definitions(self.constants, None)[0]}
+        return _type_of(table, key).validate_python(getattr(self, table)[key], context=context)
+
+
+@cache
+def _type_of(table: str, key: str) -> TypeAdapter:
+    field = Scene.model_fields[table].annotation.model_fields[key]
+    return TypeAdapter(Annotated[field.annotation, *field.metadata])
 
 
 class LawHeader(_Facts):
@@ -180,7 +162,7 @@ class RunHeader:
         shifts: whether particles of liquids and grains are shifted.
         sticking: for each axis, whether a face normal to it sticks or has friction.
         periodic: (d,), whether the domain repeats along each axis.
-        faces: the conditions of the lower and the upper wall of each axis; empty if unknown.
+        faces: the conditions of the lower and the upper wall of each axis; empty if unknown. friction: of walls.
         bodies: in the order of their labels in the frames.
         contacts: see `ContactTable.pairs`.
         laws: in the order of the labels in the frames.
@@ -209,6 +191,7 @@ class RunHeader:
     sticking: tuple[bool, ...] | None
     periodic: np.ndarray
     faces: tuple[tuple[str, str], ...]
+    friction: Friction
     bodies: tuple[BodyHeader, ...]
     contacts: tuple[tuple[str, str], ...]
     laws: tuple[LawHeader, ...]
@@ -228,7 +211,7 @@ class RunHeader:
         chosen = [
             sorted({*type(one).model_fields} - one.model_fields_set) for one in (b.material for b in scene.sources)
         ]
-        emitted = [sheets_of(emitter, scene) for emitter in scene.emitters]
+        emitted = sheets_in(scene)
         return cls.read(
             {
                 "version": __version__,
@@ -256,21 +239,21 @@ class RunHeader:
         """Read a header, and the scene in it; ValidationError, a ValueError: an entry has a wrong type."""
         facts = _StoredHeader.model_validate(dict(stored))
         scene, d = facts.scene, facts.dimension
-        domain, solver, faces = scene.domain, scene.solver, scene.domain.faces(d)
+        gravity, walls = scene.entry("domain", "gravity", ()), scene.entry("domain", "walls")
+        friction, frames = scene.entry("domain", "friction", Friction()), scene.entry("time", "frames")
+        faces = () if walls is None else walls.faces(d)
         placed = len(facts.origin) == len(facts.size) == d > 0
         origin = np.array(facts.origin) if placed else None
-        timed = any(isinstance(entry, str) for entry in domain.gravity)
-        steady = np.array([0.0 if isinstance(entry, str) else entry for entry in domain.gravity])
-        steady = steady if len(steady) == d > 0 else None
+        steady = np.array([0.0 if varies(entry) else entry for entry in gravity]) if len(gravity) == d > 0 else None
         periodic = np.array([PERIODIC in pair for pair in faces] or [False] * d, bool)
         runs_on = steady is not None and bool(steady[periodic].any())
-        total = solver.solids == "total"
+        total = scene.solver.get("solids") == "total"
         opens = tuple(OPEN in pair for pair in faces)
         particle_count_varies = bool(scene.emitters) or any(opens)
-        moved = bool(domain.wall_velocity or scene.forces or scene.impulses)
-        friction = domain.friction if isinstance(domain.friction, dict) else {"default": domain.friction}
-        rough = [any(friction.get(name, 0) > 0 for name in ("default", f"{a}_min", f"{a}_max")) for a in AXES]
+        moved = bool(scene.domain.get("wall_velocity") or scene.forces or scene.impulses)
+        rough = [any((getattr(friction, name) or 0) > 0 for name in ("default", f"{a}_min", f"{a}_max")) for a in AXES]
         sticking = tuple(own or not STICKING.isdisjoint(pair) for own, pair in zip(rough, faces, strict=False))
+        end = scene.entry("time", "end")
         return cls(
             stored=dict(stored),
             title=facts.title,
@@ -279,26 +262,27 @@ class RunHeader:
             spacing=facts.spacing,
             origin=origin,
             upper=origin + facts.size if placed else None,
-            gravity=None if timed else steady,
+            gravity=None if varies(*gravity) else steady,
             steady_gravity=steady,
-            mean_gravity=None if steady is None else _mean_gravity(scene, d),
-            driven=timed or runs_on or moved or particle_count_varies,
+            mean_gravity=None if steady is None else _mean(gravity, end or 0.0),
+            driven=varies(*gravity) or runs_on or moved or particle_count_varies,
             particle_count_varies=particle_count_varies,
-            drops=scene.output.drop_retired,
+            drops=scene.entry("output", "drop_retired", False),
             open_axes=opens,
             total=total,
-            keeps_spin=solver.transfer == "apic" and not total,
-            shifts=solver.redistribute == "auto",
+            keeps_spin=scene.solver.get("transfer", "apic") == "apic" and not total,
+            shifts=scene.solver.get("redistribute") == "auto",
             sticking=sticking or None,
             periodic=periodic,
             faces=faces,
+            friction=friction,
             bodies=_bodies(facts),
             contacts=facts.contacts,
             laws=tuple(
                 law.model_copy(update={"name": name}) for name, law in zip(facts.materials, facts.laws, strict=True)
             ),
-            end=scene.time.end,
-            frames=None if scene.time.frames is None else scene.time.frames + 1,
+            end=end,
+            frames=None if frames is None else frames + 1,
             precision=facts.precision,
             backend=facts.backend,
             scene=scene,
@@ -387,11 +371,9 @@ class RunHeader:
         return kept[body]
 
 
-def _mean_gravity(scene: _StoredScene, d: int) -> np.ndarray:
-    """Return the mean of gravity over a run, (d,), m/s^2."""
-    context = {"dimension": d, "constants": definitions(scene.constants, d)[0]}
-    entries = _GRAVITY.validate_python(list(scene.domain.gravity), context=context)
-    times = np.linspace(0.0, scene.time.end or 0.0, MOMENTS)
+def _mean(entries: Sequence[Entry], end: float) -> np.ndarray:
+    """Return the means of functions of time until `end`, s."""
+    times = np.linspace(0.0, end, MOMENTS)
     return np.array([np.nan_to_num(value_of(entry, t=times)).mean() for entry in entries])
 
 

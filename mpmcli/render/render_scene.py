@@ -25,8 +25,7 @@ from mpmcli.scene.colliders import Collider, Plane
 from mpmcli.scene.entry import value_of
 from mpmcli.scene.expand import PRESETS
 from mpmcli.scene.expression import INITIAL, POSITION, VELOCITY, evaluate
-from mpmcli.scene.schema import Emitter, usual_particles_per_cell
-from mpmcli.scene.sheets import sheets_of
+from mpmcli.scene.schema import usual_particles_per_cell
 
 # Kinds of shading: clear and thin, clear and thick, scattering inside, white crumbs, loose grains, bare metal, dull.
 Finish = Literal["water", "syrup", "translucent", "crumbly", "grains", "metal", "matte"]
@@ -232,9 +231,8 @@ def result_of_start(scene: Scene) -> Iterator[tuple[Result, tuple[Arrow, ...]]]:
     there, arrows = [], []
     for source, one in zip(sources, found, strict=True):
         shown, velocity = len(one.position), one.velocity.mean(axis=0)
-        if isinstance(source, Emitter):
-            sheets = sheets_of(source, scene)
-            shown, velocity = sheets.size * sheets.per_layer, np.array(source.velocity)
+        if one.waits:
+            shown, velocity = one.sheets.size * one.sheets.per_layer, np.array(source.velocity)
         there.append(np.arange(len(one.position)) < shown)
         arrows.append((one.position[:shown].mean(axis=0), velocity))
     for collider in scene.colliders:

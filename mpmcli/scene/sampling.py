@@ -19,7 +19,7 @@ from mpmcli.scene.quantity import place_text
 from mpmcli.scene.relaxation import relaxed
 from mpmcli.scene.schema import Body, Scene
 from mpmcli.scene.shapes import Form
-from mpmcli.scene.sheets import sheets_of
+from mpmcli.scene.sheets import Sheets, sheets_in
 
 # Points per radius^d of a sample, as measured, in 2D and 3D. Sampling to saturation would give 0.6965 and 0.7334.
 DENSITY = {2: 0.680, 3: 0.647}
@@ -312,7 +312,7 @@ class BodyParticles:
         mass: mass of each particle, kg (kg per metre of depth in 2D).
         deformation: J, (n,), or F, (n, d, d), at the start; None where there is none.
         initial: (n, d), the X of expressions, m, if it differs from the position.
-        waits: whether they belong to an emitter and enter later.
+        sheets: those of the emitter to which they belong; None for a body.
         internal: internal variables at the start, (n,), by name, among others; those at rest are missing.
     """
 
@@ -324,7 +324,7 @@ class BodyParticles:
     mass: float
     deformation: np.ndarray | None = None
     initial: np.ndarray | None = None
-    waits: bool = False
+    sheets: Sheets | None = None
     internal: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     @property
@@ -332,32 +332,43 @@ class BodyParticles:
         """Number of particles."""
         return len(self.position)
 
+    @property
+    def waits(self) -> bool:
+        """Whether they enter later."""
+        return self.sheets is not None
 
-def sample_bodies(scene: Scene) -> list[BodyParticles]:
+
+def sample_bodies(scene: Scene, places: dict[int, np.ndarray] | None = None) -> list[BodyParticles]:
     """Fill every body of a scene with particles, and then every emitter; the result is deterministic.
 
-    Memory is proportional to `estimate_particles`, which callers check first.
+    Memory is proportional to `estimate_particles`, which callers check first. `places` are positions that
+    `count_sources` found, by the index of the body; they are removed from it.
 
     Raises:
         InputError: a body is too thin for its lattice and gets no particle, or an initial value is not finite.
     """
-    found = [_sample(body, index, scene.domain) for index, body in enumerate(scene.bodies)]
-    for emitter in scene.emitters:
+    known = {} if places is None else places
+    found = [_sample(body, index, scene.domain, known.pop(index, None)) for index, body in enumerate(scene.bodies)]
+    for emitter, sheets in zip(scene.emitters, sheets_in(scene), strict=True):
         # Sheet after sheet, at the positions at which they enter.
-        sheets = sheets_of(emitter, scene)
         position = sheets.places(emitter)
         n, d = position.shape
         affine = np.broadcast_to(np.zeros((d, d)), (n, d, d))
         mass = emitter.material.density * sheets.volume
-        velocity = sheets.velocities()
-        found.append(BodyParticles(emitter.name, position, velocity, affine, sheets.volume, mass, waits=True))
+        velocity, volume = sheets.velocities(), sheets.volume
+        found.append(BodyParticles(emitter.name, position, velocity, affine, volume, mass, sheets=sheets))
     return found
 
 
 def estimate_particles(scene: Scene) -> int:
     """Return the number of particles of a scene from volumes alone: exact for boxes with a lattice, else close."""
-    bodies = sum(estimate_body(body, scene.domain.spacing) for body in scene.bodies)
-    return bodies + sum(sheets_of(emitter, scene).particles for emitter in scene.emitters)
+    return sum(estimate_sources(scene))
+
+
+def estimate_sources(scene: Scene) -> list[int]:
+    """Return how many particles each source of a scene has; see `estimate_particles`."""
+    bodies = [estimate_body(body, scene.domain.spacing) for body in scene.bodies]
+    return bodies + [sheets.particles for sheets in sheets_in(scene)]
 
 
 def estimate_body(body: Body, h: float) -> int:
@@ -375,17 +386,20 @@ def estimate_body(body: Body, h: float) -> int:
     return max(1, round(form.volume / cell))
 
 
-def count_particles(scene: Scene) -> int:
-    """Return how many particles the scene has: of each body as `count_body` says."""
-    bodies = sum(count_body(body, index, scene.domain.spacing) for index, body in enumerate(scene.bodies))
-    return bodies + sum(sheets_of(emitter, scene).particles for emitter in scene.emitters)
+def count_sources(scene: Scene, places: dict[int, np.ndarray] | None = None) -> list[int]:
+    """Return how many particles each source of a scene has: counted where that takes little time, else estimated.
 
-
-def count_body(body: Body, index: int, h: float) -> int:
-    """Return how many particles a body has: counted where that takes little time, else `estimate_body`."""
-    estimate = estimate_body(body, h)
-    counts = estimate <= (MOST_POISSON if body.sampling == "poisson" else MOST_COUNTED)
-    return len(particle_places(body, index, h)) if counts else estimate
+    `places` takes the positions found, up to MOST_COUNTED in all, by the index of the body.
+    """
+    counts, room = estimate_sources(scene), MOST_COUNTED
+    for index, body in enumerate(scene.bodies):
+        if counts[index] <= (MOST_POISSON if body.sampling == "poisson" else MOST_COUNTED):
+            found = particle_places(body, index, scene.domain.spacing)
+            counts[index] = len(found)
+            if places is not None and len(found) <= room:
+                places[index] = found
+                room -= len(found)
+    return counts
 
 
 def lattice_spacing(body: Body, h: float) -> float:
@@ -445,9 +459,10 @@ def _turned(body: Body, h: float) -> np.ndarray:
     return fitted(form, lambda: [(points, points)], spacing * turned_axes(len(lower)).T)
 
 
-def _sample(body: Body, index: int, domain: Domain) -> BodyParticles:
+def _sample(body: Body, index: int, domain: Domain, position: np.ndarray | None) -> BodyParticles:
     form = body.shape.form
-    position = particle_places(body, index, domain.spacing)
+    if position is None:
+        position = particle_places(body, index, domain.spacing)
     if not len(position):
         raise InputError(no_particles(body, domain.spacing))
     if body.relaxed:

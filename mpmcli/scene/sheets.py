@@ -203,6 +203,11 @@ def _section(shape: Shape, direction: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return (lower + upper) / 2, axes, np.abs(axes) @ ((upper - lower) / 2)
 
 
+def sheets_in(scene: Scene) -> list[Sheets]:
+    """Return the sheets of each emitter of a scene."""
+    return [sheets_of(emitter, scene) for emitter in scene.emitters]
+
+
 def sheets_of(emitter: Emitter, scene: Scene) -> Sheets:
     """Return the sheets of an emitter of a scene.
 

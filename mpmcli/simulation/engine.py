@@ -15,13 +15,9 @@ from mpmcli.solver.engine import run as engine_run
 from mpmcli.solver.machine.backend import Arch, Backend, start, stop_backend
 
 
-def backend_for(
-    scene: Scene, arch: Arch = "auto", threads: int | None = None, *, compile_cache: bool = True
-) -> Backend:
+def backend_for(scene: Scene, arch: Arch = "auto", threads: int | None = None) -> Backend:
     """Return the backend for a scene, not started; InputError: it cannot be used, or no step is stable."""
-    return engine_run.backend_for(
-        scene, lambda: expected_steps(SceneFacts(scene)), arch, threads, compile_cache=compile_cache
-    )
+    return engine_run.backend_for(scene, lambda: expected_steps(SceneFacts(scene)), arch, threads)
 
 
 # Time limit of a process, s.

@@ -10,11 +10,11 @@ from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.materials.registry import laws
 from mpmcli.output.header import RunHeader
-from mpmcli.scene import BodyParticles, Scene, sample_bodies, scene_to_toml
-from mpmcli.solver.contact.layers import Layers
+from mpmcli.scene import BodyParticles, Scene, scene_to_toml
 from mpmcli.solver.engine.batch import Batch
 from mpmcli.solver.engine.compiled_kind import CompiledKind
 from mpmcli.solver.engine.plan import make_plan, require_memory
+from mpmcli.solver.engine.resolved import Resolved
 from mpmcli.solver.engine.run import Run, build_run, frames_of_all, suits_batch
 from mpmcli.solver.frames.diagnosis import LEFT, OUTRAN, UnstableRunError
 from mpmcli.solver.grid.sparse_grid import wants_sparse
@@ -118,11 +118,11 @@ class Runner:
         kinds: list[CompiledKind] = []
         backend = None
         for scene in scenes:
-            particles = sample_bodies(scene)
-            backend = self._choose(scene)
-            if not backend.on_cpu or not self._keeps(scene, particles, backend):
+            asked = Resolved(scene).sampled()
+            backend = self._choose(asked)
+            if not backend.on_cpu or not self._keeps(asked, backend):
                 continue
-            kind = CompiledKind.of(scene, particles)
+            kind = asked.kind
             place = next((i for i, known in enumerate(kinds) if known.joined(kind) is not None), None)
             if place is None:
                 kinds.append(kind)
@@ -142,17 +142,17 @@ class Runner:
 
         Frames are given to `observe` instead of being kept, if there is one; `particles` are those of the scene.
         """
-        particles = particles or sample_bodies(scene)
-        backend = self._choose(scene)
-        if self._alike:
-            require_memory(make_plan(scene, backend))
-        if self._keeps(scene, particles, backend):
+        asked = Resolved(scene, particles).sampled()
+        backend = self._choose(asked)
+        keeps = self._keeps(asked, backend)
+        if self._alike or not keeps:
+            require_memory(make_plan(asked, backend))
+        if keeps:
             backend = replace(backend, threads=1) if backend.on_cpu and not self._alike else backend
-            run = Run(self._batch_for(CompiledKind.of(scene, particles), backend), 0, scene, particles)
+            run = Run(self._batch_for(asked.kind, backend), 0, scene, asked.particles)
         else:
-            require_memory(make_plan(scene, backend))
             self._restart(backend)
-            run = build_run(scene, backend, particles)
+            run = build_run(asked, backend)
         recorder = Recorder(run, scene, backend, observe)
         try:
             for frame, row in run.frames(stop):
@@ -165,19 +165,18 @@ class Runner:
         """Yield the index of each scene with its recording or error, as they end; small ones run together on a GPU."""
         alone: list[int] = []
         kinds: list[tuple[CompiledKind, list[int]]] = []
-        sampled: dict[int, list[BodyParticles]] = {}
+        sampled: dict[int, Resolved] = {}
         for place, scene in enumerate(scenes):
             try:
-                particles = sample_bodies(scene)
-                backend = self._choose(scene)
+                asked = Resolved(scene).sampled()
+                backend = self._choose(asked)
             except MpmcliError as error:
                 yield place, error
                 continue
-            if backend.on_cpu or not self._keeps(scene, particles, backend):
+            if backend.on_cpu or not self._keeps(asked, backend):
                 alone.append(place)
                 continue
-            sampled[place] = particles
-            kind = CompiledKind.of(scene, particles)
+            sampled[place], kind = asked, asked.kind
             for i, (known, own) in enumerate(kinds):
                 if len(own) < self._most_runs and (joined := known.joined(kind)):
                     kinds[i] = joined, [*own, place]
@@ -191,19 +190,19 @@ class Runner:
                 outcome = error
             yield place, outcome
         for kind, places in kinds:
-            yield from self._run_together(kind, {place: (scenes[place], sampled[place]) for place in places})
+            yield from self._run_together(kind, {place: sampled[place] for place in places})
 
     def _run_together(
-        self, kind: CompiledKind, scenes: Mapping[int, tuple[Scene, list[BodyParticles]]]
+        self, kind: CompiledKind, scenes: Mapping[int, Resolved]
     ) -> Iterator[tuple[int, Recording | Exception]]:
-        backend = self._choose(next(iter(scenes.values()))[0])
+        backend = self._choose(next(iter(scenes.values())))
         batch = self._batch_for(kind, backend, len(scenes))
         runs: dict[int, Run] = {}
         recorders: dict[int, Recorder] = {}
-        for slot, (place, (scene, particles)) in enumerate(scenes.items()):
+        for slot, (place, asked) in enumerate(scenes.items()):
             try:
-                runs[place] = Run(batch, slot, scene, particles)
-                recorders[place] = Recorder(runs[place], scene, backend)
+                runs[place] = Run(batch, slot, asked.scene, asked.particles)
+                recorders[place] = Recorder(runs[place], asked.scene, backend)
             except Exception as error:
                 yield place, error
         for place, event in frames_of_all(runs):
@@ -214,9 +213,9 @@ class Runner:
             else:
                 yield place, recorders[place].stopped(event) if isinstance(event, UnstableRunError) else event
 
-    def _choose(self, scene: Scene) -> Backend:
-        own = {"optimisation": self._optimisation, "doubles": Layers.of(scene).separate}
-        return choose_backend(self._arch, self._threads, scene.solver.precision, **own)
+    def _choose(self, asked: Resolved) -> Backend:
+        own = {"optimisation": self._optimisation, "doubles": asked.layers.separate}
+        return choose_backend(self._arch, self._threads, asked.scene.solver.precision, **own)
 
     def _restart(self, backend: Backend) -> None:
         self._batches.clear()
@@ -238,9 +237,9 @@ class Runner:
         self._batches.append(Batch(wanted.padded(), backend, power_of_two(runs)))
         return self._batches[-1]
 
-    def _keeps(self, scene: Scene, particles: Sequence[BodyParticles], backend: Backend) -> bool:
-        """Return whether a scene with these particles uses kernels that are kept for others."""
-        count = sum(len(body.position) for body in particles)
-        if wants_sparse(scene) and backend.on_cpu:
+    def _keeps(self, asked: Resolved, backend: Backend) -> bool:
+        """Return whether a scene uses kernels that are kept for others."""
+        count = sum(body.count for body in asked.particles)
+        if wants_sparse(asked.scene) and backend.on_cpu:
             return False
         return self._alike or (suits_batch(count, backend) and (count < FEW_PARTICLES or not backend.on_cpu))

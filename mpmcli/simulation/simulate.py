@@ -4,10 +4,13 @@ import time
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
+from mpmcli.check.facts import SceneFacts
 from mpmcli.check.finding import Finding, merged, passes
+from mpmcli.check.forecast import expected_steps
 from mpmcli.check.result_check import check_result
 from mpmcli.check.scene_check import SceneCheck, check_scene
 from mpmcli.errors import DiskFullError, InputError, MpmcliError, RunError
@@ -21,13 +24,13 @@ from mpmcli.output.header import RunHeader
 from mpmcli.output.layout import DAMAGED, sealed_segments
 from mpmcli.output.series import SERIES, write_series
 from mpmcli.output.store import HOLD, SegmentStore
-from mpmcli.scene import LoadedScene, Scene, scene_to_toml
-from mpmcli.simulation.engine import backend_for
+from mpmcli.scene import LoadedScene, scene_to_toml
 from mpmcli.simulation.resume import Resumption, file_digests, find_resumption, go_on, require_same_run, take_over
 from mpmcli.simulation.settings import RunSettings, StopCondition
 from mpmcli.simulation.summary import RunSummary, Stopwatch
 from mpmcli.solver.engine.plan import Plan, make_plan, require_memory
-from mpmcli.solver.engine.run import Run, build_run
+from mpmcli.solver.engine.resolved import Resolved
+from mpmcli.solver.engine.run import Run, backend_for, build_run
 from mpmcli.solver.frames.diagnosis import UnstableRunError
 from mpmcli.solver.machine.backend import Backend, is_out_of_memory, out_of_memory_sentence, start
 
@@ -57,16 +60,17 @@ def simulate(
         KeyboardInterrupt: the run was interrupted before it began; nothing was written.
     """
     began = time.perf_counter()
-    scene = loaded.scene
+    asked, facts = Resolved(loaded.scene), cache(partial(SceneFacts, loaded.scene))
     check_directory(settings.directory, settings.overwrite, resume=settings.resume)
     earlier = find_resumption(loaded, settings.directory) if settings.resume else None
-    backend = backend_for(scene, settings.arch, settings.threads, compile_cache=settings.compile_cache)
-    plan = make_plan(scene, backend)
-    check = check_scene(loaded, plan=plan, directory=settings.directory, threads=backend.threads)
+    options = {"compile_cache": settings.compile_cache}
+    backend = backend_for(asked, lambda: expected_steps(facts()), settings.arch, settings.threads, **options)
+    plan = make_plan(asked, backend)
+    check = check_scene(loaded, facts=facts(), plan=plan, directory=settings.directory, threads=backend.threads)
     if not (settings.force or passes(check.findings)):
         raise InputError(refusal(loaded.source, check.findings))
     complete = earlier is not None and earlier.complete
-    run = None if complete else _build(scene, settings, plan, backend)
+    run = None if complete else _build(asked, settings, plan, backend)
     if stop():
         raise KeyboardInterrupt
     # Last, because what is in it may be replaced.
@@ -85,13 +89,13 @@ def simulate(
         return stored.pack() if run is None else stored.compute(run)
 
 
-def _build(scene: Scene, settings: RunSettings, plan: Plan, backend: Backend) -> Run:
+def _build(asked: Resolved, settings: RunSettings, plan: Plan, backend: Backend) -> Run:
     """Put a scene on the device; InputError: there is too little memory, or a particle is not in the domain."""
     require_memory(plan)
     settings.limits.require_memory(plan)
     start(backend)
     try:
-        return build_run(scene, backend, force=settings.force)
+        return build_run(asked, backend, force=settings.force)
     except (RuntimeError, MemoryError) as error:
         if not is_out_of_memory(error):
             raise

@@ -6,10 +6,9 @@ from dataclasses import dataclass, field, replace
 from mpmcli.boundaries.colliders import ColliderKind
 from mpmcli.boundaries.walls import MovingFaces, RoughFaces
 from mpmcli.materials.law import Law
-from mpmcli.scene import BodyParticles, Scene
-from mpmcli.scene.sampling import count_body
+from mpmcli.scene import Scene
 from mpmcli.scene.schema import SolverSettings
-from mpmcli.scene.sheets import sheets_of
+from mpmcli.scene.sheets import Sheets
 from mpmcli.solver.contact.layers import Layers
 from mpmcli.solver.drive.forces import Drives
 from mpmcli.solver.grid.sparse_grid import wants_sparse
@@ -65,13 +64,8 @@ class CompiledKind:
     members: tuple[Law, ...] = field(compare=False, repr=False)
 
     @staticmethod
-    def of(scene: Scene, particles: Sequence[BodyParticles] | None = None) -> "CompiledKind":
-        """Return the kind of a scene with these particles, one entry per source; without, they are counted."""
-        if particles is None:
-            counts = [count_body(body, i, scene.domain.spacing) for i, body in enumerate(scene.bodies)]
-            counts += [sheets_of(emitter, scene).particles for emitter in scene.emitters]
-        else:
-            counts = [len(own.position) for own in particles]
+    def of(scene: Scene, layers: Layers, counts: Sequence[int], sheets: Sequence[Sheets]) -> "CompiledKind":
+        """Return the kind of a scene with as many particles of each source, and these sheets of each emitter."""
         names = scene.laws
         places = [members_of(scene, name) for name in names]
         members = law_objects(scene)
@@ -87,14 +81,14 @@ class CompiledKind:
             # Rigid bodies alone have none, but fields have an entry.
             tuple(max(1, sum(counts[i] for i in own)) for own in places),
             tuple(max(1, len(own)) for own in places),
-            needs_filling(scene, members, Layers.of(scene)),
+            needs_filling(scene, members, layers),
             fine_nodes(scene, members),
             keeps_motion(scene, members),
             wants_sparse(scene),
             ColliderKind.of(scene),
             Drives.of(scene, places)[0],
-            Inflow.of(scene, names),
-            Layers.of(scene),
+            Inflow.of(scene, names, sheets),
+            layers,
             members,
         )
 

@@ -14,6 +14,7 @@ from mpmcli.boundaries.doubles import as_double
 from mpmcli.frames.frame import ACTIVE, BLOCKED, WAITING
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene, highest_speed
+from mpmcli.scene.sheets import Sheets
 from mpmcli.solver.engine.device import Device
 from mpmcli.solver.engine.run_state import Layout, RunState
 from mpmcli.solver.particles.inflow import RETRY, first_ids
@@ -214,20 +215,21 @@ class GpuEmission:
                     self.emission.begin(e, group, w, p, self.late[w])
 
 
-def begin_emission(batch: object, slot: int, scene: Scene, particles: Sequence[int]) -> None:
+def begin_emission(batch: object, slot: int, scene: Scene, found: Sequence[Sheets], particles: Sequence[int]) -> None:
     """Store the mouths of the emitters of a run and the times of their sheets.
 
     Args:
         batch: the `Batch`.
         slot: slot of the run in the batch.
         scene: the scene of the run.
+        found: sheets of each emitter.
         particles: number of particles of each source.
     """
     run = batch.state(slot)
     run.slowest = max((highest_speed(emitter, scene.time.end) for emitter in scene.emitters), default=0.0)
     if batch.device.features.emission is None:
         return
-    found = batch.device.features.emission.write(scene, first_ids(scene, particles), slot)
+    batch.device.features.emission.write(scene, found, first_ids(scene, particles), slot)
     for e, (sheets, emitter) in enumerate(zip(found, scene.emitters, strict=True)):
         # A sheet enters at the first step after its due time; no sheet is due from `until` on.
         start = float(sheets.due[0]) if sheets.count else emitter.start

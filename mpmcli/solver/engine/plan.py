@@ -12,9 +12,9 @@ from mpmcli.plain_text import size_text
 from mpmcli.scene import Scene
 from mpmcli.scene.sampling import has_expressions
 from mpmcli.solver.engine.batch import Batch
-from mpmcli.solver.engine.compiled_kind import CompiledKind
 from mpmcli.solver.engine.device import Device
 from mpmcli.solver.engine.refusals import require_possible
+from mpmcli.solver.engine.resolved import Resolved
 from mpmcli.solver.frames.columns import FrameColumns
 from mpmcli.solver.grid.grid import Grid
 from mpmcli.solver.machine.backend import LARGEST_INDEX, MEMORY_SHARE, Backend, free_memory
@@ -81,14 +81,15 @@ class Plan:
         }
 
 
-def make_plan(scene: Scene, backend: Backend) -> Plan:
+def make_plan(scene: Scene | Resolved, backend: Backend) -> Plan:
     """Return the plan of a scene.
 
     Raises:
         InputError: the scene combines what cannot be combined, or needs what the backend lacks.
     """
-    require_possible(scene, backend)
-    kind = CompiledKind.of(scene)
+    asked = Resolved.of(scene)
+    require_possible(asked, backend)
+    scene, kind = asked.scene, asked.kind
     with fields_of(backend.precision) as made:
         batch = Batch(kind.padded(), backend)
     device, members = batch.device, kind.members

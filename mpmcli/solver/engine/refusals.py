@@ -1,16 +1,16 @@
 """What a scene cannot combine, and what a backend cannot compute."""
 
 from mpmcli.errors import InputError
-from mpmcli.scene import Scene
 from mpmcli.scene.contact_table import MOST_FIELDS, ContactTable
-from mpmcli.solver.contact.layers import Layers
+from mpmcli.solver.engine.resolved import Resolved
 from mpmcli.solver.machine.backend import Backend
 
 
-def refusals(scene: Scene, backend: Backend) -> list[str]:
+def refusals(asked: Resolved, backend: Backend) -> list[str]:
     """Return a sentence for each thing of a scene that is not available beside another, or on a backend."""
-    solver, layers, free = scene.solver, Layers.of(scene), any(collider.free for collider in scene.colliders)
-    moving, total = any(collider.driven for collider in scene.colliders), solver.solids == "total"
+    scene, layers, solver = asked.scene, asked.layers, asked.scene.solver
+    free, moving = (any(getattr(one, word) for one in scene.colliders) for word in ("free", "driven"))
+    total = solver.solids == "total"
     on_gpu, single, here = not backend.on_cpu, not backend.doubles, f"with --arch {backend.arch}"
     # What the scene has, with what it is not available, and the remedy.
     table = {
@@ -46,7 +46,7 @@ def refusals(scene: Scene, backend: Backend) -> list[str]:
     ]
 
 
-def require_possible(scene: Scene, backend: Backend) -> None:
+def require_possible(asked: Resolved, backend: Backend) -> None:
     """Raise an InputError that lists all `refusals` of a scene."""
-    if found := refusals(scene, backend):
+    if found := refusals(asked, backend):
         raise InputError("\n".join(found))

@@ -12,13 +12,12 @@ from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.scene import BodyParticles, Scene, estimate_particles, sample_bodies
 from mpmcli.scene.colliders import Collider
-from mpmcli.solver.contact.layers import Layers
 from mpmcli.solver.drive.expressions import RunValues
 from mpmcli.solver.drive.forces import Drives, ExternalForces
 from mpmcli.solver.engine.batch import Batch
-from mpmcli.solver.engine.compiled_kind import CompiledKind
 from mpmcli.solver.engine.emission import begin_emission
 from mpmcli.solver.engine.refusals import require_possible
+from mpmcli.solver.engine.resolved import Resolved
 from mpmcli.solver.engine.run_group import RunGroup, groups_of, require_inside
 from mpmcli.solver.engine.run_state import (
     ATTEND,
@@ -101,7 +100,8 @@ class Run:
         self.first_step_seconds = self.frame_seconds = self.frame_processor_seconds = 0.0
         self.spacing = scene.domain.spacing
         self._particles = particles or sample_bodies(scene)
-        self._counts_of_sources = [len(b.position) for b in self._particles]
+        self._counts_of_sources = [b.count for b in self._particles]
+        self._sheets = [b.sheets for b in self._particles if b.waits]
         self.particle_count = sum(self._counts_of_sources)
         require_inside(scene, self._particles)
         self._state = batch.state(slot)
@@ -146,7 +146,7 @@ class Run:
         state.collider = collider_limit(h, max(speeds, default=0.0))
         for g, group in enumerate(self.groups):
             state.sensitivity[g], state.hardening[g] = group.law.sensitivity, group.law.hardening
-        begin_emission(self.batch, self.slot, scene, self._counts_of_sources)
+        begin_emission(self.batch, self.slot, scene, self._sheets, self._counts_of_sources)
 
     # Properties and progress.
 
@@ -619,7 +619,7 @@ FEW_ON_GPU = 100_000
 
 
 def backend_for(
-    scene: Scene,
+    scene: Scene | Resolved,
     expected_steps: Callable[[], int],
     arch: Arch = "auto",
     threads: int | None = None,
@@ -635,8 +635,9 @@ def backend_for(
     Raises:
         InputError: the backend cannot be used.
     """
-    doubles, precision = Layers.of(scene).separate, scene.solver.precision
-    backend = choose_backend(arch, threads, precision, compile_cache=compile_cache, doubles=doubles)
+    asked = Resolved.of(scene)
+    scene, doubles = asked.scene, asked.layers.separate
+    backend = choose_backend(arch, threads, scene.solver.precision, compile_cache=compile_cache, doubles=doubles)
     if not backend.on_cpu:
         return backend
     threads = threads or useful_threads(estimate_particles(scene), backend.threads)
@@ -649,7 +650,7 @@ def suits_batch(particles: int, backend: Backend) -> bool:
 
 
 def build_run(
-    scene: Scene, backend: Backend, particles: list[BodyParticles] | None = None, *, force: bool = False
+    scene: Scene | Resolved, backend: Backend, particles: list[BodyParticles] | None = None, *, force: bool = False
 ) -> Run:
     """Return the run of a scene, alone in a batch, on a started backend.
 
@@ -660,6 +661,7 @@ def build_run(
     Raises:
         InputError: a particle is outside the domain, or the backend cannot compute the scene.
     """
-    require_possible(scene, backend)
-    particles = particles or sample_bodies(scene)
-    return Run(Batch(CompiledKind.of(scene, particles).padded(), backend), 0, scene, particles, force=force)
+    asked = Resolved(scene, particles) if particles else Resolved.of(scene)
+    require_possible(asked, backend)
+    asked = asked.sampled()
+    return Run(Batch(asked.kind.padded(), backend), 0, asked.scene, asked.particles, force=force)

@@ -10,7 +10,6 @@ import numpy as np
 from mpmcli.frames.frame import ACTIVE, BLOCKED, RETIRED, STATUS, WAITING, Frame
 from mpmcli.frames.ledger import LOADS, RIGID, LedgerRow
 from mpmcli.scene import BodyParticles, Scene
-from mpmcli.scene.sheets import sheets_of
 from mpmcli.solver.frames.columns import FrameArrays, FrameColumns, ParticleConstants, RunConstants, parts_of
 from mpmcli.stability.transfer_factors import affine_moment
 
@@ -295,7 +294,7 @@ class FrameBuilder:
         shown = [*self._names, *columns]
         self.columns = FrameColumns(scene.dimension, internal, shown, particle_count_varies=scene.particle_count_varies)
         self._waits = np.array([b.waits for b in particles])
-        self._sheets = [sheets_of(emitter, scene) for emitter in scene.emitters]
+        self._sheets = [b.sheets for b in particles if b.waits]
         self._origin = np.array(scene.domain.origin)
         # Far from zero, single precision does not resolve neighbouring particles; the solver does, because its
         # positions are relative to the origin of the domain.

@@ -16,8 +16,7 @@ from mpmcli.boundaries.walls import REACH
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
 from mpmcli.scene.contact_table import ContactTable
-from mpmcli.scene.sampling import estimate_body
-from mpmcli.scene.sheets import sheets_of
+from mpmcli.scene.sampling import estimate_sources
 from mpmcli.solver.grid.grid import Grid, LinearNodes, drift_allowed
 from mpmcli.solver.machine.backend import LARGEST_INDEX, MEMORY_SHARE
 from mpmcli.solver.particles.sort import ACTIVE, SPAN, TileOrder
@@ -503,5 +502,5 @@ def wants_sparse(scene: Scene) -> bool:
 
 def filled_cells(scene: Scene) -> float:
     """Return the number of cells filled by all material of a scene at rest."""
-    bodies = sum(estimate_body(body, scene.domain.spacing) / body.particles_per_cell for body in scene.bodies)
-    return bodies + sum(sheets_of(emitter, scene).particles / emitter.particles_per_cell for emitter in scene.emitters)
+    counts = zip(scene.sources, estimate_sources(scene), strict=True)
+    return sum(n / source.particles_per_cell for source, n in counts)

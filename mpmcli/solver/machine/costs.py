@@ -16,8 +16,7 @@ from mpmcli.boundaries.colliders import ColliderKind
 from mpmcli.materials.law import Law
 from mpmcli.materials.registry import laws
 from mpmcli.scene import Scene
-from mpmcli.scene.sampling import estimate_body
-from mpmcli.scene.sheets import sheets_of
+from mpmcli.scene.sampling import estimate_sources
 from mpmcli.solver.contact.layers import Layers
 from mpmcli.solver.machine.backend import Optimisation
 
@@ -88,14 +87,13 @@ def _table() -> dict:
 
 def cost_of(scene: Scene, optimisation: Optimisation) -> Cost:
     """Return the cost of a scene at a level of optimisation; a plugin law costs as much as the most expensive law."""
-    table, axis, h, layers = _table(), scene.dimension - 2, scene.domain.spacing, Layers.of(scene)
+    table, axis, layers = _table(), scene.dimension - 2, Layers.of(scene)
     how = "few" if optimisation == "few" else "most"
     known = {law: entry[how][axis] for law, entry in table["laws"].items()}
     costs = {s.material.law: known.get(s.material.law, max(known.values())) for s in scene.sources}
     seconds = SHARED + sum(compiling - SHARED for compiling, _ in costs.values())
-    counts = [estimate_body(body, h) for body in scene.bodies]
-    counts += [sheets_of(emitter, scene).particles for emitter in scene.emitters]
-    step = 1e-9 * sum(n * costs[s.material.law][1] for s, n in zip(scene.sources, counts, strict=True))
+    counts = zip(scene.sources, estimate_sources(scene), strict=True)
+    step = 1e-9 * sum(n * costs[source.material.law][1] for source, n in counts)
     beside = {
         "colliders": any(not collider.free for collider in scene.colliders),
         "rigid": any(collider.free for collider in scene.colliders),
@@ -127,7 +125,8 @@ def members_of(scene: Scene, law: str) -> list[int]:
 
 def law_objects(scene: Scene) -> tuple[Law, ...]:
     """Return the laws of a scene; without material one of any parameters, which no particle has."""
-    materials = [[scene.sources[i].material for i in members_of(scene, name)] for name in scene.laws]
-    if not scene.sources:
-        materials = [[laws()[name].parameters(density=1.0, youngs_modulus=1.0) for name in scene.laws]]
-    return tuple(laws()[name](own, scene.dimension) for name, own in zip(scene.laws, materials, strict=True))
+    found = []
+    for name in scene.laws:
+        law, own = laws()[name], [scene.sources[i].material for i in members_of(scene, name)]
+        found.append(law(own or [law.parameters(density=1.0, youngs_modulus=1.0)], scene.dimension))
+    return tuple(found)

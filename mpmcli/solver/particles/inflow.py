@@ -19,7 +19,7 @@ from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
 from mpmcli.scene.domain import OPEN
 from mpmcli.scene.entry import varies
-from mpmcli.scene.sheets import Sheets, fastest_inflow, sheets_of
+from mpmcli.scene.sheets import Sheets, fastest_inflow
 from mpmcli.solver.particles.sort import entry_count
 from mpmcli.solver.transfer.splines import PAD
 
@@ -44,12 +44,12 @@ class Inflow:
     sheets: int = 0
 
     @staticmethod
-    def of(scene: Scene, laws: Sequence[str]) -> "Inflow":
-        """Return the constants of a scene; `laws` are the names of the laws in order."""
+    def of(scene: Scene, laws: Sequence[str], sheets: Sequence[Sheets]) -> "Inflow":
+        """Return the constants of a scene; `laws` are the names of the laws in order, `sheets` those of emitters."""
         groups = tuple(laws.index(emitter.material.law) for emitter in scene.emitters)
-        found = [(emitter, sheets_of(emitter, scene)) for emitter in scene.emitters]
-        cells = max((sheets.mouth.filled.size for _, sheets in found), default=0)
-        timed = max((sheets.count for emitter, sheets in found if varies(emitter.rate)), default=0)
+        pairs = zip(scene.emitters, sheets, strict=True)
+        cells = max((one.mouth.filled.size for one in sheets), default=0)
+        timed = max((one.count for emitter, one in pairs if varies(emitter.rate)), default=0)
         return Inflow(groups, cells, open_faces(scene.domain.walls.faces(scene.dimension)), timed)
 
     def with_room_for(self, *others: "Inflow") -> "Inflow":
@@ -108,9 +108,8 @@ class Emission:
         own = self.velocity, self.spacing, self.low, self.cells, self.lead, self.stretches
         self._rows = Rows(self.ids, self.centre, self.axes, *own)
 
-    def write(self, scene: Scene, ids: Sequence[int], run: int = 0) -> list[Sheets]:
-        """Set the mouths of a run, given the first ids of its emitters; return the sheets of each."""
-        found = [sheets_of(emitter, scene) for emitter in scene.emitters]
+    def write(self, scene: Scene, found: Sequence[Sheets], ids: Sequence[int], run: int = 0) -> None:
+        """Set the mouths of a run, given the sheets and the first id of each of its emitters."""
         mouths = [sheets.mouth for sheets in found]
         pairs = zip(scene.emitters, mouths, strict=True)
         self.known[run] = 1.0
@@ -129,7 +128,6 @@ class Emission:
             [[one.lead for one in found]],
             self.known[run : run + 1],
         )
-        return found
 
     @ti.func
     def clear(self, e: ti.template(), run: int):
