@@ -96,16 +96,14 @@ def slips_in(settings: SolverSettings, rough: Sequence[tuple[int, int]]) -> bool
 
 
 @ti.func
-def friction_of_walls(particles: ti.template(), group: ti.template(), p: int, kick: float, counts: bool):
+def friction_of_walls(particles: ti.template(), group: ti.template(), p: int, kick: float):
     """Return the acceleration, m/s^2, of a particle by friction on the walls that push it.
 
     Friction acts like a spring with a slider: it is the stiffness of the push times the slip, and at most the
     coefficient times the push (Cundall and Strack 1979; docs/theory.md, 3.4). Friction that only stops the velocity
     would let a particle creep under the forces of other particles in each step.
 
-    Args:
-        kick: duration of the last motion, s.
-        counts: whether the slip after that motion is stored.
+    `kick` is the duration of the last motion, s; the slip after it is stored.
     """
     d = ti.static(group.dimension)
     row, F = group.row(p), group.stored(p)
@@ -137,9 +135,8 @@ def friction_of_walls(particles: ti.template(), group: ti.template(), p: int, ki
                 # In an edge between walls the larger slip per axis is stored. Away from walls the slip is zero.
                 if ti.abs(slip[c]) > ti.abs(kept[c]):
                     kept[c] = slip[c]
-    if counts:
-        for c in ti.static(range(d)):
-            group.slip[p][c] = kept[c]
+    for c in ti.static(range(d)):
+        group.slip[p][c] = kept[c]
     return total
 
 

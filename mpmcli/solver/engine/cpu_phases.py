@@ -33,11 +33,10 @@ from mpmcli.solver.particles.sort import (
 )
 from mpmcli.solver.particles.state_bounds import NOTHING
 from mpmcli.solver.transfer.cpu_transfers import (
+    add_over_tiles,
     nodes_of_blocks,
     nodes_of_rows,
     over_tiles,
-    scatter_pencils,
-    scatter_range,
     update_blocks,
     update_rows,
 )
@@ -398,18 +397,21 @@ class CpuPhases(RunPhases):
     @ti.func
     def each_in_pencils(self, at: ti.template()):
         """Apply the function of a phase to particles that add to nodes, pencil by pencil."""
-        self.in_pencils(at, at.item, self.time_of(at))
+        self.in_pencils(at, at.item, self.time_of(at), False)
 
     @ti.func
-    def in_pencils(self, at: ti.template(), op: ti.template(), how: float):
-        """Carry out an operation that adds to nodes, pencil by pencil."""
+    def in_pencils(self, at: ti.template(), op: ti.template(), how: float, by_tiles: ti.template()):
+        """Carry out an operation that adds to nodes, pencil by pencil, or `by_tiles` in the window of the thread."""
         first, after = 0, 0
         if at.turn < self.colours:
             first, after = self.pencils(at.order, at.turn, at.region, at.part)
             for r in range(first, after):
                 pencil = at.order.pencil_of(at.turn, r)
-                begin, end = at.order.first_particle_of(pencil), at.order.first_particle_of(pencil + 1)
-                over(at, op, begin, end, how)
+                if ti.static(by_tiles):
+                    add_over_tiles(at, op, at.order.first_tile_of(pencil), at.order.first_tile_of(pencil + 1), how)
+                else:
+                    begin, end = at.order.first_particle_of(pencil), at.order.first_particle_of(pencil + 1)
+                    over(at, op, begin, end, how)
         # On a sparse grid a sort follows each entry of particles.
         if ti.static(self.device.particle_count_varies and not at.grid.sparse):
             if at.turn == self.colours and at.region == 0 and at.part == 0:
@@ -459,19 +461,13 @@ class CpuPhases(RunPhases):
         if ti.static(at.group.uses_f_bar):
             needed = True
         if needed:
-            self.in_pencils(at, AVERAGE, at.step.dt)
+            self.in_pencils(at, AVERAGE, at.step.dt, False)
 
     @ti.func
     def scatter(self, at: ti.template()):
         """Scatter particles of the g-th group."""
-        kick, relaxed = at.step.kick, at.step.relaxed
-        if at.turn < self.colours:
-            first, after = self.pencils(at.order, at.turn, at.region, at.part)
-            scatter_pencils(at, first, after, kick, relaxed)
-        if ti.static(self.device.particle_count_varies and not at.grid.sparse):
-            if at.turn == self.colours and at.region == 0 and at.part == 0:
-                first, after = self.come_in(at.g, at.order, at.run)
-                scatter_range(at.particles, at.g, at.group, first, after, kick, relaxed)
+        (inner, op) = ti.static((changed(at, sums=None), self.device.scatters[at.g]))
+        self.in_pencils(inner, op, at.step.kick, at.grid.sparse)
 
     @ti.func
     def relax(self, at: ti.template()):

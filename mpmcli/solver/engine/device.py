@@ -22,6 +22,7 @@ from mpmcli.solver.particles.state_bounds import NOTHING
 from mpmcli.solver.transfer.advance import advance_of
 from mpmcli.solver.transfer.node_update import NodeUpdate
 from mpmcli.solver.transfer.particle_update import NOT_LOST, ParticleUpdate
+from mpmcli.solver.transfer.scatter import scatter_of
 from mpmcli.solver.transfer.splines import PAD
 
 
@@ -65,6 +66,12 @@ class Device:
     def particle_count_varies(self) -> bool:
         """Whether particles enter or leave during a run."""
         return self.groups[0].particle_count_varies
+
+    @cached_property
+    def scatters(self) -> tuple[Operation, ...]:
+        """P2G of each law."""
+        how = {"keeps": self.grid.scheme.keeps_flip_velocity, "repels": self.particles.repels}
+        return tuple(scatter_of(group, **how) for group in self.groups)
 
     @cached_property
     def advances(self) -> tuple[Operation, ...]:

@@ -40,7 +40,7 @@ from mpmcli.solver.particles.state_bounds import (
 )
 from mpmcli.solver.transfer.cpu_transfers import nodes_of_rows
 from mpmcli.solver.transfer.lanes import LANES
-from mpmcli.solver.transfer.particle_update import NOT_LOST, ParticleUpdate
+from mpmcli.solver.transfer.particle_update import NOT_LOST
 from mpmcli.solver.transfer.run_sums import (
     WARP,
     RunSums,
@@ -201,9 +201,8 @@ class GpuPhases(RunPhases):
     @ti.func
     def scatter(self, at: ti.template()):
         """Scatter a particle."""
-        layer = at.group.layer_of(at.q)
-        (particles,) = ti.static((self.particles_in(at, layer),))
-        particles.scatter(at.g, at.group, at.q, at.step.kick, at.step.relaxed, None)
+        (own,) = ti.static((changed(at, sums=None),))
+        one(own, self.device.scatters[at.g], at.q, at.step.kick)
 
     @ti.func
     def scatter_run(self, g: ti.template(), w: int, thread: int, length: ti.template()):
@@ -215,17 +214,12 @@ class GpuPhases(RunPhases):
         p = thread // WARP * (WARP * length) + thread % WARP
         for _ in range(length):
             if p < run.particles[g]:
-                layer = view.groups[g].layer_of(w * ti.static(self.device.capacity[g]) + p)
-                (particles,) = ti.static((self.particles_in(view, layer),))
-                (step,) = ti.static((view.step,))
                 place = w * ti.static(self.device.capacity[g]) + p
-                particles.scatter(g, view.groups[g], place, step.kick, step.relaxed, own)
+                (at,) = ti.static((Item(view, Phase("scatter", "particles", "scatter", g), 0, place, self.peaks),))
+                (inner,) = ti.static((changed(at, sums=own),))
+                one(inner, self.device.scatters[g], place, at.step.kick)
             p += WARP
         flush(own)
-
-    def particles_in(self, at: Item | RunView, layer: object) -> ParticleUpdate:
-        """Return the particle update with the nodes of a layer, which is a variable of a kernel."""
-        return at.particles if at.grid.layers == 1 else at.particles.with_nodes(at.grid.in_layer(layer, None))
 
     @ti.func
     def to_float(self, at: ti.template()):

@@ -40,8 +40,8 @@ from mpmcli.solver.frames.recorder import FrameRecorder, moment_of, steps_of
 from mpmcli.solver.grid.sparse_grid import WANTED, first_nodes_of
 from mpmcli.solver.machine.backend import Arch, Backend, choose_backend
 from mpmcli.solver.machine.costs import cheapest, useful_threads
-from mpmcli.solver.particles.state_bounds import StateBounds, state_bounds_of
-from mpmcli.solver.transfer.particle_update import NOT_LOST, SMALLEST_J
+from mpmcli.solver.particles.state_bounds import SMALLEST_J, StateBounds, state_bounds_of
+from mpmcli.solver.transfer.particle_update import NOT_LOST
 from mpmcli.stability.limits import Limit, collider_limit, force_limit
 
 # Particle-steps of the first launch, target wall time of later launches, s, and largest growth of steps from one launch

@@ -19,9 +19,8 @@ from mpmcli.scene import Scene
 from mpmcli.solver.drive.forces import DriveValues, HostValues
 from mpmcli.solver.engine.device import Device
 from mpmcli.solver.engine.run_state import ATTEND, BEYOND, COLLAPSED, LIMITS, LOST, Layout, RunState
-from mpmcli.solver.particles.state_bounds import StateBounds
+from mpmcli.solver.particles.state_bounds import SMALLEST_J, StateBounds
 from mpmcli.solver.transfer.kept_motion import kept_share
-from mpmcli.solver.transfer.particle_update import SMALLEST_J
 from mpmcli.solver.transfer.redistribution import farthest_shift
 from mpmcli.solver.transfer.splines import TransferScheme
 from mpmcli.stability.limits import DEFORMATION, Limit, crossing_step, deformation_limit, mode_limit, speed_limit

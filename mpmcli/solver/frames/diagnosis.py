@@ -10,7 +10,7 @@ import numpy as np
 from mpmcli.errors import RunError
 from mpmcli.materials.tensors import determinant
 from mpmcli.scene import Domain
-from mpmcli.solver.transfer.particle_update import SMALLEST_J
+from mpmcli.solver.particles.state_bounds import SMALLEST_J
 from mpmcli.solver.transfer.splines import PAD
 
 

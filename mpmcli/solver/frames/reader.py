@@ -7,7 +7,7 @@ from mpmcli.solver.frames.builder import Sums, axis_pairs
 from mpmcli.solver.frames.columns import FrameColumns, stress_entries
 from mpmcli.solver.particles.arrays import MASS, VOLUME
 from mpmcli.solver.particles.sort import stay_rolled
-from mpmcli.solver.particles.state_bounds import volume_ratio
+from mpmcli.solver.particles.state_bounds import SMALLEST_J, volume_ratio
 from mpmcli.solver.transfer.lanes import (
     LANES,
     constants_of,
@@ -20,7 +20,6 @@ from mpmcli.solver.transfer.lanes import (
     vector_of,
     zero_lanes,
 )
-from mpmcli.solver.transfer.particle_update import SMALLEST_J
 from mpmcli.solver.transfer.volume import stretch_to
 
 # Index of the sum that is 0 if a particle is crushed, inverted or not finite, else 1.

@@ -35,14 +35,12 @@ class Column(NamedTuple):
     """What an operation reads or writes of a particle, see `loop`.
 
     Attributes:
-        field: its field; None for the row of the table.
         shape: its shape, () for a number.
-        entries: the entry of the field for each of its numbers, row by row.
+        entries: for each of its numbers, row by row, a field and the entry of it; empty for the row of the table.
     """
 
-    field: ti.Field | None
     shape: tuple[int, ...]
-    entries: tuple[tuple[int, ...], ...]
+    entries: tuple[tuple[ti.Field, tuple[int, ...]], ...]
 
 
 @ti.data_oriented
@@ -194,10 +192,10 @@ class ParticleArrays:
         """Return the column of a name.
 
         They are x, "place" (the position on the grid), v, C, "remainder" (of x), "deformation" (J - 1 or F - I),
-        "growth", and "row", the row of the table.
+        "inner" (internal variables), "growth", "borne", and "row", the row of the table.
         """
         d = self.dimension
-        along, square = tuple(np.ndindex(d)), tuple(np.ndindex(d, d))
+        along, square, number = tuple(np.ndindex(d)), tuple(np.ndindex(d, d)), ((),)
         changes = self.displacement_gradient, (d, d), square
         found = {
             "x": (self.x, (d,), along),
@@ -205,11 +203,19 @@ class ParticleArrays:
             "v": (self.v, (d,), along),
             "C": (self.gradient, (d, d), tuple((a, c) for c, a in square)),
             "remainder": (self.gradient, (d,), tuple((c, d) for c in range(d))),
-            "deformation": (self.J_minus_1, (), ((),)) if self.displacement_gradient is None else changes,
-            "growth": (self.growth, (), ((),)),
+            "deformation": (self.J_minus_1, (), number) if self.displacement_gradient is None else changes,
+            "growth": (self.growth, (), number),
+            "borne": (self.borne, (), number),
             "row": (None, (self.table.n,), ()),
         }
-        return Column(*found[name])
+        if name == "inner":
+            return Column((max(len(self.internal), 1),), tuple((one, ()) for one in self.internal))
+        field, shape, entries = found[name]
+        return Column(shape, tuple((field, entry) for entry in entries))
+
+    def distinct(self, names: Sequence[str]) -> tuple[str, ...]:
+        """Return some columns without "place" where x, which is the same, is among them."""
+        return tuple(name for name in names if name != "place" or self.total or "x" not in names)
 
     @property
     def state(self) -> tuple[ti.Field, ...]:

@@ -36,7 +36,8 @@ class Pass:
     """A function of one particle, `body(at, p, how, *values)`.
 
     Attributes:
-        body: the function; the names of its parameters after the third are those of the values that it takes.
+        body: the function; the names of its parameters after the third are those of the values that it takes. Without
+            one the values given are zero.
         gives: the values that it returns, in order, with their sizes: numbers, "d" for the dimension, "nodes" for the
             nodes of a stencil along an axis, "width" for the numbers of a node; a second size is that of the rows of a
             matrix; () for a number, INDEX or STENCIL for an integer, None for a value of the size of its column.
@@ -44,7 +45,7 @@ class Pass:
             particle.
     """
 
-    body: Callable
+    body: Callable | None
     gives: dict[str, tuple | None] = field(default_factory=dict)
     in_lanes: bool = False
 
@@ -62,7 +63,7 @@ class Operation:
         reads: columns of the particles, see `ParticleArrays.column`; passes take zeros for those that are not read.
         passes: what is done, in order.
         writes: columns that take the values with their names at the end.
-        guarded: columns that are written only if the value "sound" of the particle is 1; else it is lost.
+        guarded: columns that are written only if the value "sound" of the particle is 1. Else it is lost.
         largest: a value of which the largest is returned.
     """
 
@@ -72,17 +73,37 @@ class Operation:
     guarded: tuple[str, ...] = ()
     largest: str = ""
 
+    @property
+    def loses(self) -> bool:
+        """Whether it finds particles that are not sound."""
+        return any("sound" in step.gives for step in self.passes)
+
+    @property
+    def steps(self) -> tuple[Pass, ...]:
+        """The passes with a body."""
+        return tuple(step for step in self.passes if step.body is not None)
+
+    def shapes(self, grid: Any, group: Any) -> dict[str, tuple[int | str, ...]]:
+        """Return the shapes of all values."""
+        sizes = {"d": grid.dimension, "nodes": grid.scheme.spline.nodes, "width": grid.width}
+        found = {name: group.column(name).shape for name in self.reads}
+        for step in self.passes:
+            for name, shape in step.gives.items():
+                own = group.column(name).shape if shape is None else tuple(sizes.get(n, n) for n in shape)
+                found[name] = own
+        return found
+
 
 class ParticleValues:
     """The values of one particle by name, variables of a kernel."""
 
-    def __init__(self, op: Operation, group: Any, p: Any) -> None:
-        self.group = group
-        self.values = {name: column_of(group, group.column(name), p) for name in op.reads}
+    def __init__(self, op: Operation, at: Any, p: Any) -> None:
+        self.shapes, self.group = op.shapes(at.grid, at.group), at.group
+        self.values = {name: column_of(at.group, name, p) for name in op.reads}
 
     def take(self, names: Sequence[str], _lane: Any) -> tuple:
         """Return values of the particle."""
-        return tuple(self.values[name] if name in self.values else nothing(self.group, name) for name in names)
+        return tuple(self.values[name] if name in self.values else zeros(self, name) for name in names)
 
     def give(self, names: Sequence[str], given: tuple, _lane: Any) -> None:
         """Set values of the particle."""
@@ -96,24 +117,22 @@ class LaneValues:
     """
 
     def __init__(self, op: Operation, at: Any) -> None:
-        grid, self.group, self.by_lane = at.grid, at.group, set()
-        sizes = {"d": grid.dimension, "nodes": grid.scheme.spline.nodes, "width": grid.width}
-        self.shapes = {name: self.group.column(name).shape for name in op.reads}
-        for step in op.passes:
-            for name, shape in step.gives.items():
-                self.by_lane |= {name} if "width" in (shape or ()) else set()
-                own = self.group.column(name).shape if shape is None else tuple(sizes.get(n, n) for n in shape)
-                self.shapes[name] = own
+        self.shapes, self.group = op.shapes(at.grid, at.group), at.group
+        self.by_lane = {name for step in op.passes for name, shape in step.gives.items() if "width" in (shape or ())}
+        held = [*self.group.distinct(op.reads), *(name for step in op.steps for name in step.gives)]
         self.arrays = {
-            name: ti.lang.impl.expr_init(empty(shape, name in self.by_lane)) for name, shape in self.shapes.items()
+            name: ti.lang.impl.expr_init(empty(self.shapes[name], name in self.by_lane)) for name in dict.fromkeys(held)
         }
+        if "place" in op.reads and "place" not in self.arrays:
+            # An operation that moves particles uses it before.
+            self.arrays["place"] = self.arrays["x"]
 
     def take(self, names: Sequence[str], lane: Any) -> tuple:
         """Return values of a lane."""
         return tuple(
             value_of(self.arrays[name], self.shapes[name], lane, name in self.by_lane)
             if name in self.arrays
-            else nothing(self.group, name)
+            else zeros(self, name)
             for name in names
         )
 
@@ -123,9 +142,9 @@ class LaneValues:
             set_value(self.arrays[name], self.shapes[name], lane, name in self.by_lane, value)
 
 
-def nothing(group: Any, name: str) -> Any:
-    """Return zeros in place of a column that is not read."""
-    shape = group.column(name).shape
+def zeros(values: ParticleValues | LaneValues, name: str) -> Any:
+    """Return zeros in place of a column that is not read or of a value that no pass gives."""
+    shape = values.shapes[name] if name in values.shapes else values.group.column(name).shape
     return ti.Matrix.zero(float, *shape) if shape else 0.0
 
 
@@ -185,31 +204,39 @@ def entry_of(value: ti.template(), shape: ti.template(), k: ti.template()):
 
 
 @ti.func
-def column_of(group: ti.template(), column: ti.template(), p: int):
+def column_of(group: ti.template(), name: ti.template(), p: int):
     """Return the value of a column of particle p."""
-    if ti.static(len(column.entries) == 0):
+    (column,) = ti.static((group.column(name),))
+    if ti.static(name == "row"):
         return group.row(p)
-    elif ti.static(len(column.shape) == 2):
-        value = ti.Matrix.zero(float, column.shape[0], column.shape[1])
-        for k in ti.static(range(len(column.entries))):
-            value[k // column.shape[1], k % column.shape[1]] = column.field[p][column.entries[k]]
-        return value
-    elif ti.static(len(column.shape) == 1):
-        value = ti.Vector.zero(float, column.shape[0])
-        for k in ti.static(range(len(column.entries))):
-            value[k] = column.field[p][column.entries[k]]
-        return value
+    elif ti.static(len(column.shape) == 0):
+        return column.entries[0][0][p]
     else:
-        return column.field[p]
+        value = ti.Matrix.zero(float, *column.shape)
+        for k in ti.static(range(len(column.entries))):
+            number = entry_of_field(column.entries[k], p)
+            if ti.static(len(column.shape) == 2):
+                value[k // column.shape[1], k % column.shape[1]] = number
+            else:
+                value[k] = number
+        return value
 
 
 @ti.func
-def set_column(column: ti.template(), p: int, k: ti.template(), number: float):
-    """Set entry k of a column of particle p."""
-    if ti.static(len(column.shape) == 0):
-        column.field[p] = number
+def entry_of_field(entry: ti.template(), p: int):
+    """Return a number of particle p, given its field and the entry of it."""
+    if ti.static(len(entry[1]) == 0):
+        return entry[0][p]
     else:
-        column.field[p][ti.static(column.entries[k])] = number
+        return entry[0][p][entry[1]]
+
+
+@ti.func
+def set_entry(entry: ti.template(), p: int, number: float):
+    if ti.static(len(entry[1]) == 0):
+        entry[0][p] = number
+    else:
+        entry[0][p][entry[1]] = number
 
 
 @ti.func
@@ -231,12 +258,12 @@ def one(at: ti.template(), op: ti.template(), p: int, how: float):
     """Carry out an operation on particle p; return its value for `largest`."""
     most = NOTHING
     if ti.static(isinstance(op, Operation)):
-        (values,) = ti.static((ParticleValues(op, at.group, p),))
-        for step in ti.static(op.passes):
+        (values,) = ti.static((ParticleValues(op, at, p),))
+        for step in ti.static(op.steps):
             carry_out(at, step, p, how, values, 0)
         for name in ti.static(op.writes):
             write_one(ti.static(at.group.column(name)), p, values.values[name])
-        if ti.static(len(op.guarded) > 0):
+        if ti.static(op.loses):
             if values.values["sound"] == 1.0:
                 for name in ti.static(op.guarded):
                     write_one(ti.static(at.group.column(name)), p, values.values[name])
@@ -253,7 +280,7 @@ def one(at: ti.template(), op: ti.template(), p: int, how: float):
 def write_one(column: ti.template(), p: int, value: ti.template()):
     """Set a column of particle p."""
     for k in ti.static(range(len(column.entries))):
-        set_column(column, p, k, entry_of(value, column.shape, k))
+        set_entry(column.entries[k], p, entry_of(value, column.shape, k))
 
 
 def goes_in_lanes(op: Operation | Callable, grid: Any) -> bool:
@@ -285,16 +312,16 @@ def over_lanes(at: ti.template(), op: ti.template(), first: int, last: int, how:
         load_rows(at.group, first, 1, values.arrays["row"])
     while begin < last:
         count, origin = ti.min(LANES, last - begin), bounded(begin)
-        for name in ti.static(op.reads):
+        for name in ti.static(at.group.distinct(op.reads)):
             (column, lanes) = ti.static((at.group.column(name), values.arrays[name]))
             for k in ti.static(range(len(column.entries))):
-                load_entry(lanes, k, column.field, ti.static(column.entries[k]), origin)
+                load_entry(lanes, k, column.entries[k][0], ti.static(column.entries[k][1]), origin)
             if ti.static(name == "row"):
                 if ti.static(at.group.many_bodies):
                     load_rows(at.group, begin, count, lanes)
             elif count < LANES:
                 repeat_first(lanes, count)
-        for step in ti.static(op.passes):
+        for step in ti.static(op.steps):
             if ti.static(step.in_lanes):
                 for lane in range(LANES):
                     carry_out(at, step, begin + lane, how, values, lane)
@@ -303,7 +330,7 @@ def over_lanes(at: ti.template(), op: ti.template(), first: int, last: int, how:
                     stay_rolled(at.order.buffers.real, begin + lane)
                     carry_out(at, step, begin + lane, how, values, lane)
         sound = count
-        if ti.static(len(op.guarded) > 0):
+        if ti.static(op.loses):
             sound = 0
             for lane in range(count):
                 sound += ti.cast(values.arrays["sound"][0, lane], int)
@@ -315,12 +342,13 @@ def over_lanes(at: ti.template(), op: ti.template(), first: int, last: int, how:
             for name in ti.static(op.writes + op.guarded):
                 (column,) = ti.static((at.group.column(name),))
                 for k in ti.static(range(len(column.entries))):
-                    store_lanes(column.field, ti.static(column.entries[k]), origin, values.arrays[name], k)
+                    (field, entry) = ti.static(column.entries[k])
+                    store_lanes(field, entry, origin, values.arrays[name], k)
         else:
             for lane in range(count):
                 stay_rolled(at.order.buffers.real, begin + lane)
                 write_lane(at, op.writes, values, begin + lane, lane)
-                if ti.static(len(op.guarded) > 0):
+                if ti.static(op.loses):
                     if values.arrays["sound"][0, lane] == 1.0:
                         write_lane(at, op.guarded, values, begin + lane, lane)
                     else:
@@ -335,4 +363,4 @@ def write_lane(at: ti.template(), names: ti.template(), values: ti.template(), p
     for name in ti.static(names):
         (column,) = ti.static((at.group.column(name),))
         for k in ti.static(range(len(column.entries))):
-            set_column(column, p, k, values.arrays[name][k, lane])
+            set_entry(column.entries[k], p, values.arrays[name][k, lane])

@@ -16,6 +16,8 @@ from mpmcli.solver.particles.sort import CHUNK, share_start
 SPEED_SQUARED, RATE, J_MAX, MINUS_J_MIN, STRETCH_SQUARED = range(5)
 ENTRIES = 5
 NOTHING = -1e30
+# A particle compressed below this fraction of its volume is lost: J near zero is round-off error.
+SMALLEST_J = 1e-6
 # Workers of a measurement on a GPU. Worker k handles particles k, k + GPU_WORKERS, ...
 GPU_WORKERS = 16384
 

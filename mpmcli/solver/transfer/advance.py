@@ -8,19 +8,30 @@ from mpmcli.solver.transfer.stencils import columns, gather_linear
 from mpmcli.solver.transfer.volume import in_layer, missing_growth
 
 
+@ti.func
+def locate(at: ti.template(), _p: int, _how: float, place: ti.template()):
+    """Return the first node of the stencil of a particle in layer 0, its weights, and the distance from that node."""
+    (near,) = ti.static((at.particles.near,))
+    base, distance = at.grid.scheme.spline.stencil(place, at.grid.inverse_spacing)
+    return near.linear_index(base), at.grid.scheme.spline.weights(distance), distance
+
+
+LOCATE = Pass(locate, {"first": INDEX, "w": ("nodes", "d"), "apart": ("d",)}, in_lanes=True)
+
+
 def advance_of(group: ParticleArrays, *, keeps: bool) -> Operation:
     """Return the operation that moves particles of a group; `keeps` is whether bodies may keep their motion.
 
     `at.gravity_step` is the change of velocity by gravity in the step. The largest rate of deformation, 1/s, is
     returned.
     """
-    reads = ["x", "deformation"] + ["place"] * group.total + ["remainder"] * group.carries
+    reads = ["x", "place", "deformation"] + ["remainder"] * group.carries
     reads += ["v", "C"] * keeps + ["row"] * group.law.grows_by_constants
     states = dict.fromkeys(("v", "C", "x", "remainder", "deformation", "growth"))
     return Operation(
         reads=tuple(reads),
         passes=(
-            Pass(locate_at_rest if group.total else locate, LOCATED, in_lanes=True),
+            LOCATE,
             Pass(gather, {"share": (), "missing": (), "sums": ("width",), "moments": ("d", "width")}),
             Pass(move, states | {"rate": (), "slope": ("d", "d"), "sound": ()}, in_lanes=True),
             *[Pass(carry_surface)] * (group.surfaced and group.law.projects),
@@ -29,23 +40,6 @@ def advance_of(group: ParticleArrays, *, keeps: bool) -> Operation:
         guarded=("x",),
         largest="rate",
     )
-
-
-@ti.func
-def locate(at: ti.template(), _p: int, _dt: float, x: ti.template()):
-    """Return the first node of the stencil of a particle in layer 0, its weights, and the distance from that node."""
-    (near,) = ti.static((at.particles.near,))
-    base, distance = at.grid.scheme.spline.stencil(x, at.grid.inverse_spacing)
-    return near.linear_index(base), at.grid.scheme.spline.weights(distance), distance
-
-
-@ti.func
-def locate_at_rest(at: ti.template(), p: int, dt: float, place: ti.template()):
-    """Return the same on the grid of the state at rest."""
-    return locate(at, p, dt, place)
-
-
-LOCATED = {"first": INDEX, "w": ("nodes", "d"), "apart": ("d",)}
 
 
 @ti.func

@@ -68,13 +68,6 @@ def load_deformation(group: ti.template(), origin: int, deformation: ti.template
 
 
 @ti.func
-def load_vectors(lanes: ti.template(), field: ti.template(), origin: int):
-    """Copy the vectors of the particles from `origin` on, one entry per row."""
-    for c in ti.static(range(lanes.n)):
-        load_entry(lanes, c, field, (c,), origin)
-
-
-@ti.func
 def load_entry(lanes: ti.template(), k: ti.template(), field: ti.template(), entry: ti.template(), origin: int):
     """Copy an entry of the particles from `origin` on to row k of an array; all are read before any is written."""
     row = ti.Vector.zero(float, LANES)
@@ -111,15 +104,6 @@ def load_rows(group: ti.template(), begin: int, count: int, rows: ti.template())
 
 
 @ti.func
-def load_layers(behind: ti.template(), grid: ti.template(), group: ti.template(), begin: int, count: int):
-    """Set `behind` to the index offsets, from layer 0, of the nodes of `count` particles from `begin` on."""
-    if ti.static(group.layers > 1):
-        for lane in range(LANES):
-            # Memory beyond the last particle holds no row number of the table.
-            behind[lane] = group.layer_of(begin + ti.min(lane, count - 1)) * ti.static(grid.node_count)
-
-
-@ti.func
 def matrix_of(lanes: ti.template(), first: ti.template(), d: ti.template(), lane: int):
     """Return a d x d matrix of a lane from the rows from `first` on; zero if there are no such rows."""
     result = ti.Matrix.zero(float, d, d)
@@ -140,40 +124,6 @@ def vector_of(lanes: ti.template(), first: ti.template(), size: ti.template(), l
 
 
 @ti.func
-def set_vector(lanes: ti.template(), first: ti.template(), vector: ti.template(), lane: int):
-    """Set the rows of a lane from `first` on to a vector, if there are that many."""
-    if ti.static(first + vector.n <= lanes.n):
-        for i in ti.static(range(vector.n)):
-            lanes[first + i, lane] = vector[i]
-
-
-@ti.func
-def set_matrix(lanes: ti.template(), first: ti.template(), matrix: ti.template(), lane: int):
-    """Set the rows of a lane from `first` on to a matrix, row by row, if there are that many."""
-    if ti.static(first + matrix.n * matrix.m <= lanes.n):
-        for i, j in ti.static(ti.ndrange(matrix.n, matrix.m)):
-            lanes[first + i * matrix.m + j, lane] = matrix[i, j]
-
-
-@ti.func
-def set_deformation(group: ti.template(), lanes: ti.template(), deformation: ti.template(), lane: int):
-    """Set J - 1 or F - I of a lane."""
-    if ti.static(group.law.deformation == "F"):
-        set_matrix(lanes, 0, deformation, lane)
-    else:
-        lanes[0, lane] = deformation
-
-
-@ti.func
-def deformation_of(group: ti.template(), deformation: ti.template(), lane: int):
-    """Return J - 1, or F - I as a d x d matrix, of a lane."""
-    if ti.static(group.law.deformation == "F"):
-        return matrix_of(deformation, 0, ti.static(group.dimension), lane)
-    else:
-        return deformation[0, lane]
-
-
-@ti.func
 def stored_of(group: ti.template(), deformation: ti.template(), lane: int):
     """Return J, or F as a d x d matrix, of a lane."""
     if ti.static(group.law.deformation == "F"):
@@ -186,38 +136,3 @@ def stored_of(group: ti.template(), deformation: ti.template(), lane: int):
 @ti.func
 def constants_of(rows: ti.template(), lane: int):
     return vector_of(rows, CONSTANTS, ti.static(rows.n - CONSTANTS), lane)
-
-
-@ti.func
-def node_values_of(lanes: ti.template(), first: ti.template(), count: ti.template(), lane: int):
-    """Return `count` of the nodal values of a lane, from number `first` on."""
-    result = ti.Vector.zero(float, count)
-    for c in ti.static(range(count)):
-        result[c] = lanes[lane, first + c]
-    return result
-
-
-@ti.func
-def node_rows_of(
-    lanes: ti.template(),
-    d: ti.template(),
-    width: ti.template(),
-    first: ti.template(),
-    columns: ti.template(),
-    lane: int,
-):
-    """Return `columns` columns, from `first` on, of the d x width matrix that a lane stores row by row."""
-    result = ti.Matrix.zero(float, d, columns)
-    for c in ti.static(range(columns)):
-        for a in ti.static(range(d)):
-            result[a, c] = lanes[lane, a * width + first + c]
-    return result
-
-
-@ti.func
-def weights_of(weights: ti.template(), nodes: ti.template(), d: ti.template(), lane: int):
-    w = ti.Matrix.zero(float, nodes, d)
-    for k in ti.static(range(nodes)):
-        for a in ti.static(range(d)):
-            w[k, a] = weights[k * d + a, lane]
-    return w

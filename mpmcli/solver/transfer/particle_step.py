@@ -1,7 +1,6 @@
 """The two halves of a step of one particle: its contribution to nodes in P2G, and its update from nodes in G2P.
 
-Both are functions of local variables only, so that the loops over lanes on the CPU (`cpu_transfers`) and the threads of
-a GPU (`particle_update`) compile the same functions. MLS-MPM (Hu et al. 2018) with APIC (Jiang et al. 2015) or AFLIP;
+Both are functions of local variables only, for `scatter` and `advance`. MLS-MPM (Hu et al. 2018) with APIC (Jiang et al. 2015) or AFLIP;
 see docs/theory.md, 2.
 """
 
@@ -9,10 +8,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from mpmcli.quick_taichi import ti
-from mpmcli.solver.contact.total_solids import friction_of_walls, pulled_back, push_of_walls
+from mpmcli.solver.contact.total_solids import pulled_back, push_of_walls
 from mpmcli.solver.particles.arrays import MASS, VOLUME
 from mpmcli.solver.particles.state_bounds import deformation_rate, volume_growth
-from mpmcli.solver.transfer.volume import even, log_volume, missing_to_mean, stretch_to
+from mpmcli.solver.transfer.volume import even, log_volume, stretch_to
 
 
 @dataclass(frozen=True)
@@ -26,7 +25,7 @@ class Sender:
         state: J or F.
         inner: internal variables.
         row, constants: its row of the table of its group, and the constants of the law in that row.
-        loads: the loads returned by `loads_on`.
+        loads: the external loads.
         borne: the share of its stress that it bears.
     """
 
@@ -100,27 +99,6 @@ class NodeSums:
     moment: Any
     old_velocity: Any
     old_moment: Any
-
-
-@ti.func
-def loads_on(particles: ti.template(), g: ti.template(), group: ti.template(), p: int, kick: float, counts: bool):
-    """Return the attributes of `Loads` for particle p; for `counts` see `friction_of_walls`."""
-    d = ti.static(group.dimension)
-    share, missing, slope = 0.0, 0.0, ti.Matrix.zero(float, d, d)
-    push, touch, friction = ti.Vector.zero(float, d), ti.Vector.zero(float, d), ti.Vector.zero(float, d)
-    if ti.static(particles.grid.scheme.keeps_flip_velocity):
-        share = group.kept[group.row_number(p)]
-    if ti.static(group.uses_f_bar):
-        missing = missing_to_mean(particles.grid, g, group, p)
-    if ti.static(group.has_body_force):
-        push, slope = group.force.acceleration(group, p, kick, group.force.spreads)
-    if ti.static(len(group.emitters) > 0):
-        push, slope = group.mouths.steer(group.emitters, group, p, kick, push, slope)
-    if ti.static(particles.repels):
-        touch = particles.repulsion.push(group, p, particles.grid.spacing, particles.run)
-    if ti.static(group.has_wall_friction):
-        friction = friction_of_walls(particles, group, p, kick, counts)
-    return share, missing, push, slope, touch, friction
 
 
 @ti.func

@@ -1,4 +1,4 @@
-"""P2G and G2P of one particle by a GPU thread, with atomics, and the motion of particles on any device."""
+"""What particles meet in a step, and how they relax, move and are lost."""
 
 from collections.abc import Sequence
 from copy import copy
@@ -10,51 +10,13 @@ from mpmcli.scene.domain import SEPARATING
 from mpmcli.solver.contact.total_solids import ParticleContact
 from mpmcli.solver.grid.grid import Grid, LinearNodes
 from mpmcli.solver.grid.period import opaque
-from mpmcli.solver.particles.arrays import MASS, VOLUME, ParticleArrays
-from mpmcli.solver.particles.state_bounds import deformation_rate, volume_ratio
-from mpmcli.solver.transfer.particle_step import Loads, Sender, loads_on, p2g
-from mpmcli.solver.transfer.run_sums import RunSums, move_to
+from mpmcli.solver.particles.arrays import ParticleArrays
+from mpmcli.solver.particles.state_bounds import deformation_rate
 from mpmcli.solver.transfer.splines import PAD
-from mpmcli.solver.transfer.stencils import add_linear
 from mpmcli.solver.transfer.volume import level_volume, relax_volume
 from mpmcli.stability.limits import OVERLAP
 
-
-@ti.func
-def scatter_volume(x: ti.template(), volume: float, grid: ti.template(), atomic: ti.template()):
-    """Add the volume at rest of a particle, m^3, to `grid.filling`."""
-    base, distance = grid.scheme.spline.stencil(x, grid.inverse_spacing)
-    w = grid.scheme.spline.weights(distance)
-    middle = ti.Vector.zero(float, grid.filling.n)
-    middle[ti.static(grid.dimension)] = volume
-    change = ti.Matrix.zero(float, ti.static(grid.dimension), grid.filling.n)
-    if ti.static(grid.deterministic):
-        middle[ti.static(grid.dimension)] = volume * grid.fixed.volume_scale()
-        add_linear(grid.fixed.filling, grid, grid.linear_index(base), w, middle, change, atomic)
-    else:
-        add_linear(grid.filling, grid, grid.linear_index(base), w, middle, change, atomic)
-
-
-@ti.func
-def add_fixed(
-    sums: ti.template(),
-    grid: ti.template(),
-    first: int,
-    w: ti.template(),
-    mass: float,
-    middle: ti.template(),
-    change: ti.template(),
-):
-    """Scale momentum and mass and add them to sums in fixed point if they fit; return whether they fit."""
-    fits = grid.fixed.scaled(mass, middle, change)
-    if fits:
-        add_linear(sums, grid, first, w, middle, change, True)
-    return fits
-
-
 NOT_LOST = 2**31 - 1
-# A particle compressed below this fraction of its volume is lost: J near zero is round-off error.
-SMALLEST_J = 1e-6
 # Largest distance beyond an open face, cells, at which particles wait for the next sort to retire them; nodes extend so
 # far.
 BEYOND = 1.99
@@ -62,7 +24,7 @@ BEYOND = 1.99
 
 @ti.data_oriented
 class ParticleUpdate:
-    """Both halves of a step of a particle on a GPU; for the CPU see `cpu_transfers`.
+    """What particles meet in a step (see `scatter` and `advance`), and how they relax, move and are lost.
 
     Attributes:
         near: the nodes that stencils address: those of the grid, or on a sparse grid those of a window.
@@ -110,43 +72,6 @@ class ParticleUpdate:
         result = copy(self)
         result.near = nodes
         return result
-
-    @ti.func
-    def scatter(self, g: ti.template(), group: ti.template(), p: int, kick: float, relaxed: float, run: ti.template()):
-        """Scatter one particle to the `RunSums` of the thread, or with atomics; a crushed one is lost.
-
-        Its stress would spread NaN.
-        """
-        state, row = group.stored(p), group.row(p)
-        if volume_ratio(group, state) > SMALLEST_J:
-            (grid,) = ti.static((self.near,))
-            v, C = group.motion(p)
-            inner, constants = group.inner(p), group.constants(p)
-            place, here = group.on_grid(p), group.x[p]
-            share, missing, push, slope, touch, friction = loads_on(self, g, group, p, kick, True)
-            (loads,) = ti.static((Loads(share, missing, push, slope, touch, friction),))
-            borne = 1.0
-            if ti.static(group.eased):
-                borne = group.borne[p]
-            (own,) = ti.static((Sender(place, here, v, C, state, inner, row, constants, loads, borne),))
-            base, distance = grid.scheme.spline.stencil(place, grid.inverse_spacing)
-            middle, change, plastic, inner_after = p2g(self, group, own, distance, kick)
-            if ti.static(group.law.projects):
-                group.change(p, plastic, inner_after)
-            w, first = grid.scheme.spline.weights(distance), grid.linear_index(base)
-            if ti.static(isinstance(run, RunSums)):
-                move_to(run, first)
-                add_linear(run, grid, first, w, middle, change, False)
-            elif ti.static(grid.deterministic):
-                if not add_fixed(grid.fixed.nodes, grid, first, w, row[MASS], middle, change):
-                    grid.fixed.note(group.id[p])
-            else:
-                add_linear(grid.nodes, grid, first, w, middle, change, True)
-        else:
-            self.lose(g, group, p)
-        if ti.static(self.grid.keeps_filling):
-            if relaxed > 0.0:
-                scatter_volume(group.x[p], row[VOLUME], self.grid, True)
 
     @ti.func
     def relax(self, g: ti.template(), group: ti.template(), p: int, relaxed: float):
