@@ -1,7 +1,7 @@
 """The two halves of a step of one particle: its contribution to nodes in P2G, and its update from nodes in G2P.
 
-Both are functions of local variables only, for `scatter` and `advance`. MLS-MPM (Hu et al. 2018) with APIC (Jiang et al. 2015) or AFLIP;
-see docs/theory.md, 2.
+Both are functions of local variables only, for `scatter` and `advance`. MLS-MPM (Hu et al. 2018) with APIC (Jiang et
+al. 2015) or AFLIP; see docs/theory.md, 2.
 """
 
 from dataclasses import dataclass
