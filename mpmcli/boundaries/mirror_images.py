@@ -104,8 +104,7 @@ class MirrorImages:
 
         Args:
             first: index in a node of the first component, an entry of `Grid.parts`.
-            place: depth, mirror and upper of `Walls.place`, the acting walls of `Walls.acting`, and the sticking walls
-                of `Walls.holding` with the same `rubbed`.
+            place: that of `Walls.state` with the same `rubbed`.
             gravity_step: change of velocity by gravity in this step, m/s.
             rubbed: whether friction acts.
         """
@@ -143,7 +142,7 @@ class MirrorImages:
         for images in range(self.image_sets(every)):
             if images & every == images:
                 mirrored = self.mirrored_value(value, images, depth, holds, upper, 1.0)
-                grid.set_part(self.image(grid, node, mirror, images), first, mirrored)
+                grid.set_part(grid.linear_index(self.image(node, mirror, images)), first, mirrored)
 
     @ti.func
     def image_sum(
@@ -167,7 +166,8 @@ class MirrorImages:
         every = self.every_image(acts, depth)
         for images in range(self.image_sets(every)):
             if images & every == images:
-                value = pulled(grid.part(self.image(grid, node, mirror, images), first), self.dimension, gravity_step)
+                index = grid.linear_index(self.image(node, mirror, images))
+                value = pulled(grid.part(index, first), self.dimension, gravity_step)
                 total += self.mirrored_value(value, images, depth, holds, upper, value[self.dimension])
         return total
 
@@ -189,13 +189,40 @@ class MirrorImages:
         return sets
 
     @ti.func
-    def image(self, grid: ti.template(), node: ti.template(), mirror: ti.template(), images: int):
-        """Return the linear index of an image."""
+    def image(self, node: ti.template(), mirror: ti.template(), images: int):
+        """Return an image of a node, given its mirrors."""
         place = node
         for i, a in ti.static(enumerate(self.walls.axes)):
             if images >> i & 1 == 1:
                 place[a] = mirror[a]
-        return grid.linear_index(place)
+        return place
+
+    @ti.func
+    def owner(self, node: ti.template()):
+        """Return the node inside the domain of which a node is the image, and 1 or -1 per component of its velocity."""
+        depth, mirror, _upper, acts, holds = self.walls.state(node, False)
+        beyond = 0
+        for i, a in ti.static(enumerate(self.walls.axes)):
+            if acts[a] == 1 and depth[a] < 0:
+                beyond += ti.static(2**i)
+        return self.image(node, mirror, beyond), self.signs(beyond, holds)
+
+    @ti.func
+    def signs(self, images: int, holds: ti.template()):
+        """Return 1 or -1 per component of a velocity and its image.
+
+        The component normal to a wall is always reflected, the others only if the wall sticks.
+        """
+        result = ti.Vector.one(float, self.dimension)
+        for i, a in ti.static(enumerate(self.walls.axes)):
+            # An image by translation, at a periodic face, has the same value.
+            if ti.static(a not in self.walls.periodic):
+                if images >> i & 1 == 1:
+                    result[a] = -result[a]
+                    for c in ti.static(self.walls.lateral[a]):
+                        if holds[a] == 1:
+                            result[c] = -result[c]
+        return result
 
     @ti.func
     def mirrored_value(
@@ -209,20 +236,12 @@ class MirrorImages:
     ):
         """Return a mirrored momentum, or with mass 1 a mirrored velocity: reflected about the velocity of the wall.
 
-        The component normal to the wall is always reflected, the others only if the wall sticks. At an edge, two
-        reflections of a component cancel if both walls have the same velocity; otherwise the velocity is discontinuous
-        there for any choice of image.
+        At an edge, two reflections of a component cancel if both walls have the same velocity; otherwise the velocity
+        is discontinuous there for any choice of image.
         """
-        result = value
-        for i, a in ti.static(enumerate(self.walls.axes)):
-            # An image by translation, at a periodic face, has the same value.
-            if ti.static(a not in self.walls.periodic):
-                if images >> i & 1 == 1:
-                    for c in ti.static(range(self.dimension)):
-                        if ti.static(c == a):
-                            result[c] = -result[c]
-                        elif holds[a] == 1:
-                            result[c] = -result[c]
+        result, signs = value, self.signs(images, holds)
+        for c in ti.static(range(self.dimension)):
+            result[c] *= signs[c]
         if ti.static(self.walls.moves):
             shift = self.shift(images, depth, holds, upper)
             for c in ti.static(range(self.dimension)):
@@ -317,13 +336,7 @@ class MirrorImages:
     @ti.func
     def mass_at(self, grid: ti.template(), node: ti.template()):
         """Return the mass of a node and of its images at periodic faces, kg, before they are summed."""
-        mass = grid.nodes[grid.linear_index(node)][self.dimension]
-        if ti.static(len(self.walls.periodic) > 0):
-            for images in range(1, ti.static(2**self.dimension)):
-                image, exists = grid.period.image(node, images)
-                if exists:
-                    mass += grid.nodes[grid.linear_index(image)][self.dimension]
-        return mass
+        return self.walls.by_period.sum(grid.nodes, self.dimension, grid, node, 1)
 
 
 @ti.func
@@ -409,9 +422,7 @@ def column_friction(
     mass that sticking stops, as if all of it moved with one velocity.
     """
     d = ti.static(images.dimension)
-    depth, mirror, upper = images.walls.place(node)
-    acts = images.walls.acting(node, depth, mirror, upper)
-    holds = images.walls.holding(node, depth, upper, False)
+    depth, mirror, upper, acts, holds = images.walls.state(node, False)
     pressed, others = False, 0
     for a in ti.static(range(d)):
         if images.walls.ends(a, depth) and a != axis:

@@ -11,16 +11,15 @@ from copy import copy
 import numpy as np
 
 from mpmcli.boundaries.feature import Feature, changed
+from mpmcli.boundaries.images import Images
 from mpmcli.boundaries.rows import Rows
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
-from mpmcli.scene.domain import OPEN, PERIODIC, SEPARATING, STICKING
+from mpmcli.scene.domain import OPEN, SEPARATING, STICKING
 from mpmcli.scene.schema import SolverSettings
 
 # Nodes on each side of a wall that can hold mass from particles of the other side.
 REACH = 2
-# Nodes beyond a periodic face to which particles scatter before they are moved back into the domain: all of the grid.
-PERIODIC_REACH = 3
 # Entry of `Walls.contact` where the material has yet to reach the wall (docs/theory.md, 3.2).
 AWAY = -1
 
@@ -92,19 +91,14 @@ def faces_on_grid(faces: Sequence[tuple[str, str]], settings: SolverSettings) ->
 
 
 @ti.data_oriented
-class Walls:
+class Walls(Images):
     """All faces of the domain, as a boundary that acts on nodes.
 
     Attributes:
-        faces: per axis, the conditions of the lower and the upper face: "slip", "stick", "separate", PERIODIC, or OPEN
-            for none.
-        periodic: the axes of periodic faces.
         reach: number of nodes on each side of a face that may have images.
-        first: index of the node plane of the lower faces; `last`, per axis, of the upper faces.
         shape: nodes of the grid per axis.
         lateral: per axis, the other axes.
         separating: (axis, side) of every face that material may leave.
-        axes: axes whose faces are considered: all, or fewer for nodes that are near no other faces, see `along`.
         contact: (planes, nodes) int, per separating face and node of its plane, whether the material presses on it: 1,
             0, or AWAY.
         first_plane: row of `contact` of the first separating face.
@@ -133,13 +127,10 @@ class Walls:
         moving: MovingFaces = STILL,
     ) -> None:
         """Allocate one set of planes in `contact` and `impulse` for each run."""
-        self.dimension, self.axes = len(faces), tuple(range(len(faces)))
-        self.faces = tuple(tuple(pair) for pair in faces)
-        self.periodic = tuple(a for a, pair in enumerate(self.faces) if PERIODIC in pair)
-        self.reach = PERIODIC_REACH if self.periodic else REACH
+        super().__init__(faces, first, [first + n for n in cells])
+        self.reach = first if self.periodic else REACH
         self.moving, self.moves, self.slips = moving, len(moving.faces) > 0, False
-        self.first, self.shut = first, 0
-        self.last = tuple(first + n for n in cells)
+        self.shut = 0
         self.separating = tuple(
             (a, side) for a in range(self.dimension) for side in (0, 1) if self.faces[a][side] in SEPARATING
         )
@@ -220,33 +211,12 @@ class Walls:
     def place(self, node: ti.template()):
         """Return, per axis, the depth of the node inside a wall within reach, its mirror, and 1 for the upper wall.
 
-        The depth counts nodes inwards, and is REACH + 1 if no wall is within reach. At a periodic face the mirror is
-        the image beyond the opposite face; the depth is 1 inside and -1 beyond, because no node lies on a wall.
+        See `image_along`; the depth is REACH + 1 if no wall is within reach.
         """
-        depth = ti.Vector.zero(int, self.dimension)
-        mirror = node
-        upper = ti.Vector.zero(int, self.dimension)
-        for a in ti.static(range(self.dimension)):
-            depth[a] = REACH + 1
-            if ti.static(a not in self.axes):
-                pass
-            elif ti.static(self.faces[a][0] == PERIODIC):
-                period = self.last[a] - self.first
-                if node[a] <= self.first + PERIODIC_REACH:
-                    mirror[a] = node[a] + period
-                    depth[a] = ti.select(node[a] < self.first, -1, 1)
-                elif node[a] >= self.last[a] - PERIODIC_REACH:
-                    mirror[a] = node[a] - period
-                    depth[a] = ti.select(node[a] >= self.last[a], -1, 1)
-            elif node[a] <= self.first + REACH:
-                if ti.static(self.faces[a][0] != OPEN):
-                    depth[a] = node[a] - self.first
-                    mirror[a] = 2 * self.first - node[a]
-            elif node[a] >= self.last[a] - REACH:
-                if ti.static(self.faces[a][1] != OPEN):
-                    upper[a] = 1
-                    depth[a] = self.last[a] - node[a]
-                    mirror[a] = 2 * self.last[a] - node[a]
+        depth, mirror, upper = ti.Vector([REACH + 1] * self.dimension), node, ti.Vector.zero(int, self.dimension)
+        for a in ti.static(self.axes):
+            image, deep, side = self.image_along(node[a], a, REACH, 1)
+            mirror[a], depth[a], upper[a] = image, deep, side
         return depth, mirror, upper
 
     @ti.func
@@ -265,6 +235,13 @@ class Walls:
                 if depth[axis] <= REACH and upper[axis] == self.separating[f][1]:
                     acts[axis] = self.contact[self.first_plane + f, self.plane_index(inner, axis)]
         return acts
+
+    @ti.func
+    def state(self, node: ti.template(), rubbed: ti.template()):
+        """Return what `place`, `acting` and `holding` state of a node."""
+        depth, mirror, upper = self.place(node)
+        acts = self.acting(node, depth, mirror, upper)
+        return depth, mirror, upper, acts, self.holding(node, depth, upper, rubbed)
 
     @ti.func
     def plane_index(self, node: ti.template(), axis: ti.template()):

@@ -94,7 +94,7 @@ class BodyContact(Feature):
         drift = ti.cast(ti.ceil(run.drift), int)
         (view,) = ti.static(phases.see(run))
         (obstacles,) = ti.static((obstacles_of(view),))
-        self.surfaces.find_box(phases.device.grid, obstacles, run.w, drift, view.particles.last)
+        self.surfaces.find_box(phases.device.grid, obstacles, run.w, drift, view.grid.images.last)
 
     def saved(self) -> dict[str, ti.Field]:
         own = {"contact.taken": self.loads.taken, "contact.deepest": self.deepest}
@@ -277,8 +277,8 @@ class BodyContact(Feature):
         area, deepest, seen, force = 0.0, 0.0, 0.0, ti.Vector.zero(float, d)
         ways, slopes = ti.Matrix.zero(float, 2, d), ti.Matrix.zero(float, 2, d)
         pushes, weights = ti.Vector.zero(float, 2), ti.Vector.zero(float, 2)
-        for images in range(ti.static(grid.period.sets)):
-            there, exists = grid.period.image_from_inside(at.node, images)
+        for images in range(ti.static(grid.images.by_period.sets)):
+            there, exists = grid.images.by_period.image_from_inside(at.node, images)
             if exists:
                 place = self.surfaces.place_of(grid, at.w, grid.linear_index(there))
                 for q in range(ti.static(grid.scheme.spline.nodes**d)):

@@ -17,7 +17,6 @@ from mpmcli.boundaries.feature import Feature, Phase, changed
 from mpmcli.boundaries.rigid_bodies import ROUNDS
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
-from mpmcli.scene.domain import STICKING
 from mpmcli.solver.transfer.splines import QuadraticSpline
 
 # A point acts if the share of its kernel that is filled is FULL or more, not at all up to EMPTY. The share falls from 1
@@ -190,29 +189,6 @@ class ColliderPoints(Feature):
                 grid.filling[index][0] = share
 
     @ti.func
-    def owner(self, walls: ti.template(), node: ti.template()):
-        """Return the node inside the domain of which a node is the image, and 1 or -1 per component of its velocity."""
-        own, sign = node, ti.Vector.one(float, self.dimension)
-        if walls.near(node):
-            depth, mirror, upper = walls.place(node)
-            acts = walls.acting(node, depth, mirror, upper)
-            for a in ti.static(range(self.dimension)):
-                if acts[a] == 1 and depth[a] < 0:
-                    own[a] = mirror[a]
-                    self.reflect(walls, a, upper, sign)
-        return own, sign
-
-    @ti.func
-    def reflect(self, walls: ti.template(), a: ti.template(), upper: ti.template(), sign: ti.template()):
-        """Multiply the signs of a velocity by those of its mirror image at the wall of an axis."""
-        if ti.static(a not in walls.periodic):
-            for c in ti.static(range(self.dimension)):
-                if ti.static(c == a):
-                    sign[c] = -sign[c]
-                elif walls.face_in(STICKING, a, upper[a]):
-                    sign[c] = -sign[c]
-
-    @ti.func
     def around(self, node: ti.template(), c: int, way: ti.template()):
         """Return neighbour c of a node; with way = -1 the node of which this node is neighbour c."""
         found, rest = node, c
@@ -225,9 +201,9 @@ class ColliderPoints(Feature):
     # Points.
 
     @ti.func
-    def find(self, grid: ti.template(), walls: ti.template(), extent: ti.template(), node: ti.template(), kick: float):
+    def find(self, grid: ti.template(), images: ti.template(), extent: ti.template(), node: ti.template(), kick: float):
         """Find the points of a node, their weights, and the impulses with which they begin, in a step of `kick` s."""
-        d = ti.static(self.dimension)
+        d, walls = ti.static((self.dimension, images.walls))
         index = grid.linear_index(node)
         own = self.place(index)
         self.head[own] = 0
@@ -245,7 +221,7 @@ class ColliderPoints(Feature):
             p, row, place, keeps = self.head[own] - 1, self.row_of(node), 0, self.keeps(node, own)
             while p >= 0:
                 self.busy[row] = 1
-                self.weight_all(grid, walls, node, p)
+                self.weight_all(grid, images, node, p)
                 self.first[p] = ti.Vector.zero(float, d)
                 if place < KEPT and keeps:
                     self.first[p] = self.gain[p] * kick * self.kept[KEPT * own + place]
@@ -351,7 +327,7 @@ class ColliderPoints(Feature):
         return result
 
     @ti.func
-    def weight_all(self, grid: ti.template(), walls: ti.template(), node: ti.template(), p: int):
+    def weight_all(self, grid: ti.template(), images: ti.template(), node: ti.template(), p: int):
         """Find the weights of point p, which has its place in `centre`."""
         d = ti.static(self.dimension)
         i, h = self.run * self.colliders.capacity + self.collider[p], self.colliders.spacing
@@ -359,7 +335,7 @@ class ColliderPoints(Feature):
         for a in ti.static(range(d)):
             place[a] = self.centre[p][a] / h - ti.cast(node[a] - self.colliders.first - 1, float)
         along = self.spline.weights(place)
-        full = self.fill_stencil(grid, walls, node, p)
+        full = self.fill_stencil(grid, images, node, p)
         share, total, centre = 0.0, 0.0, ti.Vector.zero(float, d)
         if full > 0.0:
             for c in range(self.stencil):
@@ -375,7 +351,7 @@ class ColliderPoints(Feature):
                 if self.colliders.wall[i] != STICK:
                     weight *= self.borne(place, self.normal[p], c)
                 other = self.around(node, c, 1)
-                own, _sign = self.owner(walls, other)
+                own, _sign = images.owner(other)
                 self.spread[self.place(grid.linear_index(own))] = -1.0
                 self.marked[self.row_of(own)] = 1
                 centre += weight * self.colliders.place_of(other)
@@ -386,16 +362,16 @@ class ColliderPoints(Feature):
             self.centre[p][a] = centre[a] / ti.max(total, LEAST)
 
     @ti.func
-    def fill_stencil(self, grid: ti.template(), walls: ti.template(), node: ti.template(), p: int):
+    def fill_stencil(self, grid: ti.template(), images: ti.template(), node: ti.template(), p: int):
         """Set the weights of point p to the masses that the nodes would have without colliders.
 
         A node that is held counts as filled, but with a negative sign, because it will have no weight. Return the mass
         of a full node, kg.
         """
-        d = ti.static(self.dimension)
+        d, walls = ti.static((self.dimension, images.walls))
         most = 0.0
         for c in range(self.stencil):
-            own, _sign = self.owner(walls, self.around(node, c, 1))
+            own, _sign = images.owner(self.around(node, c, 1))
             index = grid.linear_index(own)
             mass, free = grid.nodes[index][d], self.free[self.place(index)]
             filled = 0.0
@@ -414,44 +390,25 @@ class ColliderPoints(Feature):
     # Sums.
 
     @ti.func
-    def images_of(self, walls: ti.template(), node: ti.template()):
-        """Return the depths, mirrors and sides of a node at walls, and whether each acts; see `Walls.place`."""
-        depth, mirror, upper = walls.place(node)
-        return depth, mirror, upper, walls.acting(node, depth, mirror, upper)
-
-    @ti.func
-    def spread_out(self, grid: ti.template(), walls: ti.template(), node: ti.template()):
+    def spread_out(self, grid: ti.template(), images: ti.template(), node: ti.template()):
         """Sum the weights of all points at a node and its images, and the impulses with which they begin."""
         own = self.place(grid.linear_index(node))
         if self.spread[own] < 0.0:
-            self.pushed[own], self.spread[own] = self.gathered(grid, walls, node)
+            self.pushed[own], self.spread[own] = self.gathered(grid, images, node)
 
     @ti.func
-    def gathered(self, grid: ti.template(), walls: ti.template(), node: ti.template()):
+    def gathered(self, grid: ti.template(), images: ti.template(), node: ti.template()):
         """Return the sums over the points of their impulses at a node and its images, and of their weights."""
         total, weights = ti.Vector.zero(float, self.dimension), 0.0
-        if walls.near(node):
-            depth, mirror, upper, acts = self.images_of(walls, node)
-            for images in range(ti.static(2**self.dimension)):
-                place, sign, exists = node, ti.Vector.one(float, self.dimension), True
-                for a in ti.static(range(self.dimension)):
-                    if images >> a & 1 == 1:
-                        exists = exists and acts[a] == 1 and depth[a] >= 1
-                        place[a] = mirror[a]
-                        self.reflect(walls, a, upper, sign)
-                if exists:
-                    weights += self.gather(grid, place, sign, total)
-            # Walls take what is normal to them, and if they stick all.
-            for a in ti.static(range(self.dimension)):
-                if acts[a] == 1 and depth[a] == 0:
-                    holds = walls.face_in(STICKING, a, upper[a])
-                    for c in ti.static(range(self.dimension)):
-                        if ti.static(c == a):
-                            total[c] = 0.0
-                        elif holds:
-                            total[c] = 0.0
-        else:
-            weights += self.gather(grid, node, ti.Vector.one(float, self.dimension), total)
+        depth, mirror, upper, acts, holds = images.walls.state(node, False)
+        every = images.every_image(acts, depth)
+        for k in range(images.image_sets(every)):
+            if k & every == k:
+                weights += self.gather(grid, images.image(node, mirror, k), images.signs(k, holds), total)
+        # Walls take what is normal to them, and if they stick all.
+        for a in ti.static(images.walls.axes):
+            if acts[a] == 1 and depth[a] == 0:
+                total = images.walls.stopped(total, a, depth, holds, upper, 0.0)
         return total, weights
 
     @ti.func
@@ -471,7 +428,7 @@ class ColliderPoints(Feature):
         return weights
 
     @ti.func
-    def weigh(self, grid: ti.template(), walls: ti.template(), node: ti.template(), kick: float):
+    def weigh(self, grid: ti.template(), images: ti.template(), node: ti.template(), kick: float):
         """Find the gain of the points of a node, and their impulses, unless rigid bodies have yet to be met."""
         d = ti.static(self.dimension)
         p = self.head[self.place(grid.linear_index(node))] - 1
@@ -480,7 +437,7 @@ class ColliderPoints(Feature):
             for c in range(self.stencil):
                 weight = self.weights[p * self.stencil + c]
                 if weight > 0.0:
-                    own, sign = self.owner(walls, self.around(node, c, 1))
+                    own, sign = images.owner(self.around(node, c, 1))
                     index = grid.linear_index(own)
                     share = weight / grid.nodes[index][d]
                     resistance += share * self.spread[self.place(index)]
@@ -613,43 +570,28 @@ class ColliderPoints(Feature):
             p = self.next[p] - 1
 
     @ti.func
-    def push(self, grid: ti.template(), walls: ti.template(), node: ti.template()):
+    def push(self, grid: ti.template(), images: ti.template(), node: ti.template()):
         """Give the impulses of the points to a node and its images; return the squared speed of the node."""
         d = ti.static(self.dimension)
         index, squared = grid.linear_index(node), 0.0
         own = self.place(index)
         if self.spread[own] > 0.0:
             self.spread[own] = 0.0
-            change, _weights = self.gathered(grid, walls, node)
+            change, _weights = self.gathered(grid, images, node)
             change /= grid.nodes[index][d]
-            if walls.near(node):
-                self.change_images(grid, walls, node, change)
-            else:
-                for a in ti.static(range(d)):
-                    grid.nodes[index][a] = grid.nodes[index][a] + change[a]
+            depth, mirror, _upper, acts, holds = images.walls.state(node, False)
+            every = images.every_image(acts, depth)
+            for k in range(images.image_sets(every)):
+                if k & every == k:
+                    at, signs = grid.linear_index(images.image(node, mirror, k)), images.signs(k, holds)
+                    for a in ti.static(range(d)):
+                        grid.nodes[at][a] = grid.nodes[at][a] + signs[a] * change[a]
             # Nodes inside, and light ones, hardly move particles.
             free = ti.abs(self.free[own])
             if free > 0.5 and grid.nodes[index][d] > LIGHT * free * self.density[self.run]:
                 for a in ti.static(range(d)):
                     squared += grid.nodes[index][a] ** 2
         return squared
-
-    @ti.func
-    def change_images(self, grid: ti.template(), walls: ti.template(), node: ti.template(), change: ti.template()):
-        """Change the velocity of a node near a wall and of its images."""
-        d = ti.static(self.dimension)
-        depth, mirror, upper, acts = self.images_of(walls, node)
-        for images in range(ti.static(2**d)):
-            place, sign, exists = node, ti.Vector.one(float, d), True
-            for a in ti.static(range(d)):
-                if images >> a & 1 == 1:
-                    exists = exists and acts[a] == 1 and depth[a] >= 1
-                    place[a] = mirror[a]
-                    self.reflect(walls, a, upper, sign)
-            if exists:
-                index = grid.linear_index(place)
-                for a in ti.static(range(d)):
-                    grid.nodes[index][a] = grid.nodes[index][a] + sign[a] * change[a]
 
 
 # The bodies of the phases, functions of a node. Points exist in layer 0 alone.
@@ -666,21 +608,21 @@ def fill_solids(at: ti.template(), node: ti.template(), _kick: float):
 def find_points(at: ti.template(), node: ti.template(), kick: float):
     """Find the points of a node."""
     if at.nodes.colliders.own == 0:
-        at.features.points.find(at.grid, at.nodes.images.walls, at.particles.extent, node, kick)
+        at.features.points.find(at.grid, at.nodes.images, at.particles.extent, node, kick)
 
 
 @ti.func
 def spread_points(at: ti.template(), node: ti.template(), _kick: float):
     """Sum the weights of points at a node."""
     if at.nodes.colliders.own == 0:
-        at.features.points.spread_out(at.grid, at.nodes.images.walls, node)
+        at.features.points.spread_out(at.grid, at.nodes.images, node)
 
 
 @ti.func
 def weigh_points(at: ti.template(), node: ti.template(), kick: float):
     """Find the gains of the points of a node, and without rigid bodies their impulses."""
     if at.nodes.colliders.own == 0:
-        at.features.points.weigh(at.grid, at.nodes.images.walls, node, kick)
+        at.features.points.weigh(at.grid, at.nodes.images, node, kick)
 
 
 @ti.func
@@ -717,7 +659,7 @@ def settle_points(at: ti.template(), node: ti.template(), kick: float):
 def push_points(at: ti.template(), node: ti.template(), _kick: float):
     """Give the impulses of points to a node."""
     if at.nodes.colliders.own == 0:
-        squared = at.features.points.push(at.grid, at.nodes.images.walls, node)
+        squared = at.features.points.push(at.grid, at.nodes.images, node)
         if ti.static(at.atomic):
             at.peaks.include(at.w, 0, squared)
         elif squared > at.step.speed_squared:

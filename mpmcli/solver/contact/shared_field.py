@@ -41,8 +41,8 @@ def surface_of(contact: ti.template(), at: ti.template(), c: int):
     """Return the mean normal of body c at a node, the distance of the node from its surface, m, and their weight."""
     grid, surfaces, h, d = ti.static((at.grid, contact.surfaces, at.grid.spacing, contact.dimension))
     n, far, seen = ti.Vector.zero(float, d), 0.0, 0.0
-    for images in range(ti.static(grid.period.sets)):
-        there, exists = grid.period.image_from_inside(at.node, images)
+    for images in range(ti.static(grid.images.by_period.sets)):
+        there, exists = grid.images.by_period.image_from_inside(at.node, images)
         if exists:
             place = surfaces.place_of(grid, at.w, grid.linear_index(there))
             for q in range(ti.static(grid.scheme.spline.nodes**d)):
@@ -91,16 +91,12 @@ def share_filled(contact: ti.template(), at: ti.template(), c: int, y: ti.templa
 @ti.func
 def room_at(contact: ti.template(), at: ti.template(), c: int, node: ti.template()):
     """Return the mass of the shared field at a node, kg, and the share of the kernel inside walls outside of c."""
-    grid, walls, d = ti.static((at.grid, at.obstacles.walls, contact.dimension))
+    grid, d = ti.static((at.grid, contact.dimension))
     surfaces, layer = ti.static((contact.surfaces, at.w * contact.layers + c))
-    place, free, used = node, 1.0, True
+    place, free, used = node, grid.images.share_inside(node, grid.scheme.spline), True
     for a in ti.static(range(d)):
-        if ti.static(a in grid.period.axes):
-            cells = grid.period.cells[at.w][a]
-            place[a] += ti.select(node[a] < PAD, cells, ti.select(node[a] < PAD + cells, 0, -cells))
-        else:
-            for beyond in ti.static((node[a] - walls.first, walls.last[a] - node[a])):
-                free *= grid.scheme.spline.share_below(ti.cast(beyond, float))
+        if ti.static(a in grid.images.periodic):
+            place[a] = grid.images.inside_along(node[a], a)
         beyond = place[a] - surfaces.used[2 * layer, a]
         used = used and beyond >= 0 and beyond < surfaces.used[2 * layer + 1, a]
     index = grid.linear_index(place)

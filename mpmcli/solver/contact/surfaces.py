@@ -310,7 +310,7 @@ class BodySurfaces:
             stay_rolled(self.orders[0].buffers.real, layer)
             for a in ti.static(range(d)):
                 first, end = box_of(grid, a, self.low[layer][a], self.high[layer][a], drift, last[a])
-                if ti.static(a in grid.period.axes):
+                if ti.static(a in grid.images.periodic):
                     self.low[layer][a] = ti.min(self.low[layer][a], first + drift)
                     self.high[layer][a] = ti.max(self.high[layer][a], end - reach - drift)
                 # Emitted material, and bodies that share its layer, may be anywhere in the box of all layers.
@@ -416,12 +416,12 @@ class BodySurfaces:
         `index` is the index of the node in layer 0, and `behind` the offset of the layer.
         """
         result = ti.Vector.zero(float, ti.static(self.dimension + 1))
-        if ti.static(len(grid.period.axes) == 0):
+        if ti.static(len(grid.images.periodic) == 0):
             for c in ti.static(range(self.dimension + 1)):
                 result[c] = grid.nodes[behind + index][c]
         else:
-            for images in range(ti.static(grid.period.sets)):
-                there, exists = grid.period.image_from_inside(node, images)
+            for images in range(ti.static(grid.images.by_period.sets)):
+                there, exists = grid.images.by_period.image_from_inside(node, images)
                 if exists:
                     at = behind + grid.linear_index(there)
                     for c in ti.static(range(self.dimension + 1)):
@@ -433,8 +433,8 @@ class BodySurfaces:
         """Store `met` of a node, and open the bins of the stencils that contain it."""
         self.met[place] = met
         if met > 0:
-            for images in range(ti.static(grid.period.sets)):
-                there, exists = grid.period.image_from_inside(node, images)
+            for images in range(ti.static(grid.images.by_period.sets)):
+                there, exists = grid.images.by_period.image_from_inside(node, images)
                 if exists:
                     offset = grid.linear_index(there) - grid.linear_index(node)
                     for q in range(ti.static(grid.scheme.spline.nodes**self.dimension)):
@@ -673,10 +673,8 @@ class BodySurfaces:
             if ti.static(self.layers > int(self.shares) + 1):
                 # The other body has mass at the nearest node.
                 here = ti.cast(ti.round(point * grid.inverse_spacing), int) + PAD
-                for a in ti.static(grid.period.axes):
-                    beyond = here[a] - PAD
-                    cells = grid.period.cells[w][a]
-                    here[a] += ti.select(beyond < 0, cells, ti.select(beyond >= cells, -cells, 0))
+                for a in ti.static(grid.images.periodic):
+                    here[a] = grid.images.inside_along(here[a], a)
                 place = self.bin_of(grid, w, here)
                 if place >= 0 and self.present[ti.max(place, 0)] > 255:
                     layer, overlap = self.body_around(g, grid, w, p)
@@ -717,13 +715,13 @@ class BodySurfaces:
         place, normal, overlap = ti.Vector.zero(float, d), ti.Vector.zero(float, d), ti.Vector.zero(float, d)
         for turn in range(2):
             # Without any near point there is no edge.
-            for q in range(ti.select(turn == 0 or distance < 0.0, ti.static(3**d * grid.period.sets), 0)):
+            for q in range(ti.select(turn == 0 or distance < 0.0, ti.static(3**d * grid.images.by_period.sets), 0)):
                 node, rest = base, q
                 for a in ti.static(range(d)):
                     after = ti.raw_div(rest, 3)
                     node[a] += rest - after * 3 - 1
                     rest = after
-                there, exists = grid.period.image(node, rest)
+                there, exists = grid.images.by_period.image(node, rest, 1)
                 bin_ = self.bin_of(grid, w, there)
                 if exists and bin_ >= 0:
                     for other in ti.static(self.surfaced):

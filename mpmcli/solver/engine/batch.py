@@ -167,7 +167,7 @@ class Batch:
             return drift_allowed(grid.tile, grid.scheme.spline.nodes)
         # The nodes in use include a drift of one tile. One cell is reserved for the last step before a sort; particles
         # beyond an open face are retired before they leave the grid.
-        return BEYOND - 1 if grid.opens else grid.tile - 1.0
+        return BEYOND - 1 if self.kind.inflow.opens else grid.tile - 1.0
 
     def _make_grid(self, period: Period, blocks: int, *, deterministic: bool = False) -> Grid:
         """Return the grid; a sparse grid is allocated with `blocks` blocks."""
@@ -184,7 +184,7 @@ class Batch:
             keeps_filling=kind.keeps_filling,
             averages=[averages_volume(kind.settings, law) or levels_volume(kind.settings, law) for law in kind.members],
             period=period,
-            opens=kind.inflow.opens,
+            faces=kind.faces,
             deterministic=deterministic,
             layers=kind.layers.count,
             **sparse,

@@ -131,6 +131,7 @@ class RunView:
             box=box,
             first_node=w * (device.grid.layers * device.grid.node_count),
             period=device.grid.period.seen_from(w),
+            images=changed(device.grid.images, last=last),
         )
         device.features.viewed(self)
         friction, moving, colliders = self.features.friction, self.features.moving, self.features.colliders
@@ -144,7 +145,6 @@ class RunView:
             grid=self.grid,
             near=self.grid,
             extent=extent,
-            last=last,
             first_lost=w * len(device.groups),
             friction=friction,
             moving=moving,

@@ -6,6 +6,7 @@ from copy import copy
 
 import numpy as np
 
+from mpmcli.boundaries.images import Images
 from mpmcli.boundaries.walls import REACH
 from mpmcli.quick_taichi import ti
 from mpmcli.solver.grid.period import Period
@@ -98,7 +99,7 @@ class Grid(LinearNodes):
             volume at rest times ln J, and the volume at rest, m^3; and over those that were there in the last step, of
             the volume times the growth of ln J, and the volume; None for groups that do not average volumes.
         kept_means: the entries of `means` that are not None.
-        opens: (axis, side) of every open face; nodes beyond it are ordinary nodes.
+        images: images at all walls and periodic faces; nodes beyond open faces are ordinary nodes.
         fixed: sums in fixed point, which `FixedPoint.to_float` converts to the fields; None if P2G adds to the fields
             directly.
         deterministic: whether `fixed` is not None; then all `means` are None.
@@ -120,7 +121,7 @@ class Grid(LinearNodes):
         keeps_filling: bool,
         averages: Sequence[bool],
         period: Period,
-        opens: Sequence[tuple[int, int]],
+        faces: Sequence[tuple[str, str]],
         deterministic: bool,
         layers: int = 1,
     ) -> None:
@@ -135,7 +136,7 @@ class Grid(LinearNodes):
         self.shape = tuple(self.tile * n for n in self.tiles)
         self.strides = tuple(int(np.prod(self.shape[a + 1 :])) for a in range(len(cells)))
         self.planes = scheme.spline.nodes if len(cells) == 3 else 1
-        self.runs, self.opens, self.first_node = runs, tuple(opens), 0
+        self.runs, self.first_node, self.images = runs, 0, Images(faces, PAD, [PAD + n for n in cells])
         self.node_count = self.stored_nodes()
         self.layers = layers
         count = runs * layers * self.node_count
@@ -293,16 +294,16 @@ def box_of(grid: ti.template(), axis: ti.template(), low: int, high: int, drift:
     first = low - drift
     last = high + drift + ti.static(grid.scheme.spline.nodes - 1)
     # A box near a wall includes the image nodes beyond it, because they are read and written.
-    if ti.static(axis in grid.period.axes):
+    if ti.static(axis in grid.images.periodic):
         if first <= PAD + PAD or last >= last_wall - PAD:
             first = 0
             last = last_wall + PAD
     else:
-        if ti.static((axis, 0) in grid.opens):
+        if ti.static((axis, 0) not in grid.images.mirrors):
             first = ti.max(first, 0)
         elif first <= PAD + REACH:
             first = PAD - REACH
-        if ti.static((axis, 1) in grid.opens):
+        if ti.static((axis, 1) not in grid.images.mirrors):
             last = ti.min(last, last_wall + PAD)
         elif last >= last_wall - REACH:
             last = last_wall + REACH

@@ -1,4 +1,4 @@
-"""The periodic axes of a scene (docs/theory.md, 3.6).
+"""The periodic axes of a scene (docs/theory.md, 3.6), for particles; `grid.images` has those of nodes.
 
 On the CPU particles are wrapped into the domain when they are sorted. Until then they continue, and scatter, beyond the
 face, so that pencils of one colour write disjoint nodes there too. On a GPU every step wraps them. Nodes beyond a face
@@ -15,7 +15,6 @@ from mpmcli.boundaries.rows import Rows
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
 from mpmcli.scene.domain import PERIODIC
-from mpmcli.solver.transfer.splines import PAD
 
 
 @ti.func
@@ -39,28 +38,23 @@ class Period(Feature):
 
     Attributes:
         axes: the periodic axes.
-        sets: number of sets of axes along which a node may have an image, including the empty set.
         at_once: whether every step wraps particles into the domain.
         run: number of the run of a view.
         extent: size of the domain per run and axis, m.
-        cells: cells of the domain per run and axis.
     """
 
     def __init__(self, faces: Sequence[tuple[str, str]], runs: int = 1, *, at_once: bool) -> None:
         self.dimension = len(faces)
         self.axes = tuple(a for a, pair in enumerate(faces) if PERIODIC in pair)
-        self.sets = 2**self.dimension if self.axes else 1
         self.at_once = at_once
         self.run = 0
         if self.axes:
             self.extent = ti.Vector.field(self.dimension, float, shape=runs)
-            self.cells = ti.Vector.field(self.dimension, int, shape=runs)
-            self._rows = Rows(self.extent, self.cells)
+            self._rows = Rows(self.extent)
 
     def write(self, scene: Scene, run: int = 0) -> None:
         if self.axes:
-            cells = np.array([scene.domain.cells])
-            self._rows.write(run, cells * scene.domain.spacing, cells)
+            self._rows.write(run, np.array([scene.domain.cells]) * scene.domain.spacing)
 
     def viewed(self, view: object) -> "Period":
         return self.seen_from(view.w)
@@ -125,33 +119,3 @@ class Period(Feature):
         if after >= low and after <= extent - low:
             out = 0.0
         return after, lost, out
-
-    @ti.func
-    def image(self, node: ti.template(), images: int):
-        """Return the image of a node, or of a cell, along the axes of a bit set, and whether it is on the grid.
-
-        Along a periodic axis there is at most one image, because the domain is longer than both margins.
-        """
-        place, exists = node, True
-        for a in ti.static(range(self.dimension)):
-            if images >> a & 1 == 1:
-                there = -1
-                if ti.static(a in self.axes):
-                    cells = self.cells[self.run][a]
-                    if node[a] <= 2 * PAD:
-                        there = node[a] + cells
-                    elif node[a] >= cells:
-                        there = node[a] - cells
-                place[a] = there
-                exists = exists and there >= 0
-        return place, exists
-
-    @ti.func
-    def image_from_inside(self, node: ti.template(), images: int):
-        """Return the same as `image` for a node inside the domain, and no image for one beyond a periodic face."""
-        place, exists = node, True
-        if ti.static(len(self.axes) > 0):
-            place, exists = self.image(node, images)
-            for a in ti.static(self.axes):
-                exists = exists and node[a] >= PAD and node[a] < PAD + self.cells[self.run][a]
-        return place, exists

@@ -243,9 +243,9 @@ class SparseGrid(BlockNodes, Grid):
         # Numbers of nodes that stencils of particles reach before and behind their tile.
         drift = math.ceil(drift_allowed(self.tile, self.scheme.spline.nodes))
         self.beyond = drift, drift + self.scheme.spline.nodes - 1
-        repeats = [axis in self.period.axes for axis in range(self.dimension)]
         self.reach = [
-            reach_along(n, self.tile, self.beyond, repeats=again) for n, again in zip(self.cells, repeats, strict=True)
+            reach_along(n, self.tile, self.beyond, repeats=axis in self.images.periodic)
+            for axis, n in enumerate(self.cells)
         ]
         self._most = max(table.shape[1] for table in self.reach)
         self._reach = ti.field(int, shape=(self.dimension, max(self.tiles), self._most))

@@ -102,8 +102,7 @@ class TileOrder:
     @ti.func
     def wrap(self, p: int):
         """Wrap particle p into a periodic domain."""
-        if ti.static(len(self.grid.period.axes) > 0):
-            self.grid.period.wrap(self.group, p)
+        self.grid.period.wrap(self.group, p)
 
     @ti.func
     def tile_of(self, p: int):
@@ -116,7 +115,7 @@ class TileOrder:
         if ti.static(self.particle_count_varies):
             status = self.group.activity[p]
             if status == ACTIVE:
-                for axis, side in ti.static(self.grid.opens):
+                for axis, side in ti.static(self.grid.images.opens):
                     x = self.group.x[p][axis]
                     if ti.static(side == 0):
                         if x < 0.0:

@@ -60,7 +60,7 @@ class NodeUpdate:
         # If an image beyond a wall has mass, the node inside has mass too: a stencil that reaches one contains the
         # other.
         massive = self.grid.nodes[index][ti.static(self.dimension)] > 0
-        if ti.static(len(self.grid.period.axes) > 0):
+        if ti.static(len(self.images.walls.periodic) > 0):
             # This does not hold beyond a periodic face.
             massive = massive or self.images.walls.near(node)
         if massive:
@@ -82,9 +82,7 @@ class NodeUpdate:
         kind = self.images.kind(node)
         for k, images in ti.static(enumerate(self.images.kinds)):
             if kind == k:
-                found_depth, found_mirror, found_upper = images.walls.place(node)
-                found_acts = images.walls.acting(node, found_depth, found_mirror, found_upper)
-                found_holds = images.walls.holding(node, found_depth, found_upper, True)
+                found_depth, found_mirror, found_upper, found_acts, found_holds = images.walls.state(node, True)
                 for a in ti.static(images.walls.axes):
                     depth[a], mirror[a], upper[a] = found_depth[a], found_mirror[a], found_upper[a]
                     acts[a], holds[a] = found_acts[a], found_holds[a]

@@ -6,13 +6,12 @@ from copy import copy
 from mpmcli.boundaries.rows import Rows
 from mpmcli.boundaries.walls import MovingFaces, RoughFaces
 from mpmcli.quick_taichi import ti
-from mpmcli.scene.domain import SEPARATING
+from mpmcli.scene.domain import OPEN, SEPARATING
 from mpmcli.solver.contact.total_solids import ParticleContact
 from mpmcli.solver.grid.grid import Grid, LinearNodes
 from mpmcli.solver.grid.period import opaque
 from mpmcli.solver.particles.arrays import ParticleArrays
 from mpmcli.solver.particles.state_bounds import deformation_rate
-from mpmcli.solver.transfer.splines import PAD
 from mpmcli.solver.transfer.volume import level_volume, relax_volume
 from mpmcli.stability.limits import OVERLAP
 
@@ -29,7 +28,6 @@ class ParticleUpdate:
     Attributes:
         near: the nodes that stencils address: those of the grid, or on a sparse grid those of a window.
         extent: size of the domain per axis, m.
-        last: node of the upper wall per axis.
         faces: conditions of the walls per axis.
         repulsion: contact between elastic bodies that are `total`, None without contact.
         repels: whether `repulsion` is not None.
@@ -57,7 +55,6 @@ class ParticleUpdate:
         self.dimension, self.run, self.first_lost = grid.dimension, 0, 0
         self.faces = tuple(tuple(pair) for pair in faces)
         self.extent = tuple(n * grid.spacing for n in grid.cells)
-        self.last = tuple(PAD + n for n in grid.cells)
         self.watches_box = watches_box
         self.lost = ti.field(int, shape=group_count)
         self.lost.fill(NOT_LOST)
@@ -83,7 +80,7 @@ class ParticleUpdate:
             if ti.static(group.levels):
                 change = level_volume(self.grid, g, group, p)
             else:
-                change = relax_volume(group, self.grid, self.last, p, group.x[p], relaxed)
+                change = relax_volume(group, self.grid, p, group.x[p], relaxed)
         return change
 
     @ti.func
@@ -100,7 +97,7 @@ class ParticleUpdate:
         would lose what they have stored if particles stopped at it.
         """
         springs = group.surfaced and self.faces[axis][side] in SEPARATING
-        return BEYOND if (axis, side) in self.grid.opens else OVERLAP * springs
+        return BEYOND if self.faces[axis][side] == OPEN else OVERLAP * springs
 
     @ti.func
     def moved(self, group: ti.template(), x: ti.template(), remainder: ti.template(), v: ti.template(), dt: float):
@@ -113,7 +110,7 @@ class ParticleUpdate:
         for c in ti.static(range(self.dimension)):
             way = dt * v[c] + remainder[c]
             moved = x[c] + way
-            if ti.static(c in self.grid.period.axes):
+            if ti.static(c in self.grid.images.periodic):
                 inside[c], after[c], out = self.grid.period.moved(group, x[c], way, self.extent[c], c)
                 beyond += out * self.grid.spacing
             else:

@@ -24,7 +24,6 @@ from mpmcli.solver.particles.arrays import MASS, VOLUME
 from mpmcli.solver.particles.loop import STENCIL, Operation, Pass
 from mpmcli.solver.transfer.splines import PAD, SPLINES, TransferScheme
 from mpmcli.solver.transfer.stencils import add_linear, gather_linear, node_of, origin_of
-from mpmcli.solver.transfer.volume import image_along
 from mpmcli.stability.transfer_factors import FARTHEST
 
 # Factor s of the strain e since the last shift: a particle moves by s e / (1 + s e) of the gradient of the crowding.
@@ -96,17 +95,6 @@ class FineBlocks(BlockNodes, FineGrid):
 
 
 @ti.func
-def inside_along(j: int, axis: ti.template(), grid: ti.template(), last: ti.template(), n: ti.template()):
-    """Return whether node j of a grid with n nodes per cell is not an image node beyond a face of an axis."""
-    inside = True
-    if ti.static((axis, 0) not in grid.opens):
-        inside = j >= ti.static(PAD * n)
-    if ti.static((axis, 1) not in grid.opens):
-        inside = inside and j <= last[axis] * n - ti.static(axis in grid.period.axes)
-    return inside
-
-
-@ti.func
 def clear_fine(at: ti.template(), node: ti.template(), time: float):
     """Clear a node and the fine nodes of its cell."""
     at.grid.clear(at.grid.linear_index(node))
@@ -151,18 +139,18 @@ def fold_fine(at: ti.template(), node: ti.template(), time: float):
 
     Nodes on a wall count twice, because half of their cell is outside. Images receive the same value.
     """
-    grid, fine, last, d = ti.static((at.grid, at.grid.fine, at.particles.last, at.grid.dimension))
+    grid, fine, d = ti.static((at.grid, at.grid.fine, at.grid.dimension))
     for axis in ti.static(range(d)):
         if at.turn == axis:
-            _, near = image_along(node[axis], axis, grid, last, 1, 1)
-            if ti.static(axis == d - 1) or near:
+            _, deep, _ = grid.images.image_along(node[axis], axis, 1, 1)
+            if ti.static(axis == d - 1) or deep <= 1:
                 for q in range(ti.static(fine.in_cell)):
                     place = fine.place_in_cell(node, q)
-                    if inside_along(place[axis], axis, grid, last, fine.per_cell):
-                        image, exists = image_along(place[axis], axis, grid, last, 1, fine.per_cell)
+                    image, depth, _ = grid.images.image_along(place[axis], axis, 1, fine.per_cell)
+                    if depth >= 0:
                         index = fine.linear_index(place)
                         total, beyond = fine.fill[index][0], index
-                        if exists:
+                        if depth <= 1:
                             place[axis] = image
                             beyond = fine.linear_index(place)
                             total += fine.fill[beyond][0]
@@ -170,7 +158,7 @@ def fold_fine(at: ti.template(), node: ti.template(), time: float):
                             excess = ti.max(total - 1.0, 0.0) / MILD
                             total = excess * ti.min(excess * excess, 1.0)
                         fine.fill[index][0] = total
-                        if exists:
+                        if depth <= 1:
                             fine.fill[beyond][0] = total
 
 
@@ -324,14 +312,13 @@ def fold_shift(at: ti.template(), node: ti.template(), time: float):
 
     Displacements of images are mirrored: odd along the normal of a wall.
     """
-    grid, last, d = ti.static((at.grid, at.particles.last, at.grid.dimension))
+    grid, reach, d = ti.static((at.grid, at.grid.scheme.spline.nodes - 2, at.grid.dimension))
     for axis in ti.static(range(d)):
-        if at.turn == axis and inside_along(node[axis], axis, grid, last, 1):
-            reach = ti.static(grid.scheme.spline.nodes - 2)
+        image, depth, _ = grid.images.image_along(node[axis], axis, reach, 1)
+        if at.turn == axis and depth >= 0:
             place, index = node, grid.linear_index(node)
-            image, exists = image_along(node[axis], axis, grid, last, reach, 1)
             total, beyond = grid.nodes[index], index
-            if exists:
+            if depth <= reach:
                 place[axis] = image
                 beyond = grid.linear_index(place)
                 total += mirrored(grid.nodes[beyond], axis, grid)
@@ -339,14 +326,14 @@ def fold_shift(at: ti.template(), node: ti.template(), time: float):
                 if total[d] > 0.0:
                     total /= total[d]
             grid.nodes[index] = total
-            if exists:
+            if depth <= reach:
                 grid.nodes[beyond] = mirrored(total, axis, grid)
 
 
 @ti.func
 def mirrored(value: ti.template(), axis: ti.template(), grid: ti.template()):
     result = value
-    if ti.static(axis not in grid.period.axes):
+    if ti.static(axis not in grid.images.periodic):
         result[axis] = -value[axis]
     return result
 
@@ -359,9 +346,9 @@ def held_back(at: ti.template(), x: ti.template(), way: ti.template()):
     if ti.static(at.nodes.collides):
         most = FARTHEST * at.grid.spacing * ti.static(1.0 / at.grid.fine.per_cell)
         result = at.nodes.colliders.held_back(x, way, most)
-    for a in ti.static(range(grid.dimension)):
-        if ti.static(a not in grid.period.axes and (a, 0) not in grid.opens):
+    for a, side in ti.static(grid.images.mirrors):
+        if ti.static(side == 0):
             result[a] = ti.max(result[a], -0.5 * x[a])
-        if ti.static(a not in grid.period.axes and (a, 1) not in grid.opens):
+        else:
             result[a] = ti.min(result[a], 0.5 * (at.particles.extent[a] - x[a]))
     return result

@@ -49,7 +49,7 @@ def cell_of(grid: ti.template(), x: ti.template()):
     """Return the linear index of the first node of the cell of a point."""
     cell = ti.Vector.zero(int, ti.static(grid.dimension))
     for a in ti.static(range(grid.dimension)):
-        if ti.static(a in grid.period.axes):
+        if ti.static(a in grid.images.periodic):
             # The coordinate of a particle beyond the lower face is negative.
             cell[a] = ti.cast(ti.floor(x[a] * grid.inverse_spacing), int) + PAD
         else:
@@ -121,9 +121,9 @@ def clear_mean(grid: ti.template(), g: ti.template(), group: ti.template(), p: i
     """Set the sums of the cell of particle p and of its periodic images to zero."""
     cell = in_layer(grid, group, p, cell_of(grid, group.on_grid(p)))
     clear_cell(grid, g, cell)
-    if ti.static(len(grid.period.axes) > 0):
-        for images in range(1, ti.static(2**grid.dimension)):
-            image, exists = grid.period.image(grid.place_of(cell), images)
+    if ti.static(len(grid.images.periodic) > 0):
+        for images in range(1, ti.static(grid.images.by_period.sets)):
+            image, exists = grid.images.by_period.image(grid.place_of(cell), images, 1)
             if exists:
                 clear_cell(grid, g, grid.linear_index(image))
 
@@ -148,9 +148,9 @@ def sums_at(grid: ti.template(), g: ti.template(), cell: int):
 def sums_of_cell(grid: ti.template(), g: ti.template(), cell: int):
     """Return the sums over a cell and its periodic images, after all particles were added."""
     sums = sums_at(grid, g, cell)
-    if ti.static(len(grid.period.axes) > 0):
-        for images in range(1, ti.static(2**grid.dimension)):
-            image, exists = grid.period.image(grid.place_of(cell), images)
+    if ti.static(len(grid.images.periodic) > 0):
+        for images in range(1, ti.static(grid.images.by_period.sets)):
+            image, exists = grid.images.by_period.image(grid.place_of(cell), images, 1)
             if exists:
                 more = sums_at(grid, g, grid.linear_index(image))
                 for k in ti.static(range(4)):
@@ -213,7 +213,7 @@ def level_volume(grid: ti.template(), g: ti.template(), group: ti.template(), p:
 
 
 @ti.func
-def relax_volume(group: ti.template(), grid: ti.template(), last: ti.template(), p: int, x: ti.template(), time: float):
+def relax_volume(group: ti.template(), grid: ti.template(), p: int, x: ti.template(), time: float):
     """Relax the volume of particle p, at x, towards the density on the grid, over a time, s.
 
     Returns the absolute change of the logarithm of its volume, as far as it changes its stiffness.
@@ -227,16 +227,16 @@ def relax_volume(group: ti.template(), grid: ti.template(), last: ti.template(),
         scale *= grid.inverse_spacing
     filled, opens, relaxes, change = 0.0, 0.0, True, 0.0
     if ti.static(group.law.opens_at_surfaces):
-        filled, slope = filling_around(x, grid, last, scale)
+        filled, slope = filling_around(x, grid, scale)
         opens = filling_below_surface(slope, grid.scheme.spline)
     else:
-        held, least = held_around(x, grid, last)
+        held, least = held_around(x, grid)
         filled = held * scale
         relaxes = least * scale > FULL
         # In the dead band of the law, where most particles are, it does not matter.
         J = volume_ratio(group, group.stored(p))
         if relaxes and 1.0 / filled > ti.min(ti.max(J, 1.0) + DEAD_BAND, J + LARGEST_LACK):
-            opens = ti.select(held_beside(x, grid, last) > BESIDE * held, 1.0, 0.0)
+            opens = ti.select(held_beside(x, grid) > BESIDE * held, 1.0, 0.0)
     if relaxes:
         seen = 1.0 / filled
         if ti.static(grid.has_solids and not group.law.opens_at_surfaces):
@@ -255,7 +255,7 @@ def relax_volume(group: ti.template(), grid: ti.template(), last: ti.template(),
 
 
 @ti.func
-def held_around(x: ti.template(), grid: ti.template(), last: ti.template()):
+def held_around(x: ti.template(), grid: ti.template()):
     """Return the weighted mean and the minimum, over the stencil of a point, of the nodal mass or volume after P2G.
 
     It is the mass, kg, or the volume, m^3, if nodes store the volume scattered to them.
@@ -266,17 +266,13 @@ def held_around(x: ti.template(), grid: ti.template(), last: ti.template()):
     base, distance = grid.scheme.spline.stencil(x, grid.inverse_spacing)
     w = grid.scheme.spline.weights(distance)
     first = grid.linear_index(base)
-    near_wall = False
-    for a in ti.static(range(d)):
-        if ti.static(a in grid.period.axes):
-            near_wall = near_wall or base[a] <= 2 * PAD or base[a] + 1 + reach >= last[a] - PAD
-        else:
-            if ti.static((a, 0) not in grid.opens):
-                near_wall = near_wall or base[a] <= PAD + reach
-            if ti.static((a, 1) not in grid.opens):
-                near_wall = near_wall or base[a] + 1 + 2 * reach >= last[a]
+    near_face = False
+    for a in ti.static(grid.images.axes):
+        for j in ti.static((base[a], base[a] + 1 + reach)):
+            _, depth, _ = grid.images.image_along(j, a, reach, 1)
+            near_face = near_face or depth <= reach
     mean, least = 0.0, 1e30
-    if near_wall:
+    if near_face:
         # Not unrolled: copies of the sum over images would take half of the compile time of a 3D scene.
         for q in range(ti.static(grid.scheme.spline.nodes**d)):
             node, rest, weight = base, q, 1.0
@@ -287,7 +283,7 @@ def held_around(x: ti.template(), grid: ti.template(), last: ti.template()):
                 for k in ti.static(range(grid.scheme.spline.nodes)):
                     if place == k:
                         weight *= w[k, a]
-            held = image_sum(node, grid, last, reach, True)
+            held = grid.images.sum(grid.holding, d, grid, node, reach)
             mean += held * weight
             least = ti.min(least, held)
     else:
@@ -332,14 +328,14 @@ def solid_around(x: ti.template(), grid: ti.template()):
 
 
 @ti.func
-def filling_around(x: ti.template(), grid: ti.template(), last: ti.template(), scale: float):
+def filling_around(x: ti.template(), grid: ti.template(), scale: float):
     """Return the filled fraction of the grid at a point, and its gradient per cell; what is behind walls is full."""
     d, nodes = ti.static(grid.dimension, grid.scheme.spline.nodes)
     base, distance = grid.scheme.spline.stencil(x, grid.inverse_spacing)
     w = grid.scheme.spline.weights(distance)
     filled, moment = 0.0, ti.Vector.zero(float, d)
     for q in range(ti.static(nodes**d)):
-        node, weight, way, free = base, 1.0, -distance, 1.0
+        node, weight, way = base, 1.0, -distance
         for a in ti.static(range(d)):
             place = q // ti.static(nodes ** (d - 1 - a)) % ti.static(nodes)
             node[a] += place
@@ -347,11 +343,8 @@ def filling_around(x: ti.template(), grid: ti.template(), last: ti.template(), s
             for k in ti.static(range(nodes)):
                 if place == k:
                     weight *= w[k, a]
-            if ti.static(a not in grid.period.axes and (a, 0) not in grid.opens):
-                free *= grid.scheme.spline.share_below(ti.cast(node[a] - PAD, float))
-            if ti.static(a not in grid.period.axes and (a, 1) not in grid.opens):
-                free *= grid.scheme.spline.share_below(ti.cast(last[a] - node[a], float))
-        part = weight * (image_sum(node, grid, last, ti.static(nodes - 2), False) * scale + 1.0 - free)
+        held = grid.images.by_period.sum(grid.holding, d, grid, node, 1)
+        part = weight * (held * scale + 1.0 - grid.images.share_inside(node, grid.scheme.spline))
         filled += part
         moment += part * way
     return filled, moment.norm() * ti.static(grid.scheme.spline.inverse_moment)
@@ -373,7 +366,7 @@ def filling_below_surface(slope: float, spline: ti.template()):
 
 
 @ti.func
-def held_beside(x: ti.template(), grid: ti.template(), last: ti.template()):
+def held_beside(x: ti.template(), grid: ti.template()):
     """Return the smallest nodal mass or volume among the nodes beside the stencil of a point, two along each axis."""
     d = ti.static(grid.dimension)
     base, _ = grid.scheme.spline.stencil(x, grid.inverse_spacing)
@@ -383,84 +376,16 @@ def held_beside(x: ti.template(), grid: ti.template(), last: ti.template()):
         node, share, used = base, 1.0, True
         for b in ti.static(range(d)):
             node[b] += ti.select(side // 2 == b, offset, 1)
-            if ti.static(b in grid.period.axes):
-                # The node may be outside the grid; its image is inside.
-                if node[b] < PAD:
-                    node[b] += last[b] - PAD
-                elif node[b] >= last[b]:
-                    node[b] -= last[b] - PAD
-            if ti.static(b not in grid.period.axes and (b, 0) not in grid.opens):
-                if node[b] < PAD:
-                    node[b] = 2 * PAD - node[b]
-                if node[b] == PAD:
-                    share *= 2.0
-            if ti.static(b not in grid.period.axes and (b, 1) not in grid.opens):
-                if node[b] > last[b]:
-                    node[b] = 2 * last[b] - node[b]
-                if node[b] == last[b]:
-                    share *= 2.0
+            # The node may be outside the grid; the one of which it is the image is inside.
+            image, depth, _ = grid.images.image_along(node[b], b, 0, 1)
+            if depth < 0:
+                node[b] = image
+            elif depth == 0:
+                share *= 2.0
             # Nodes that are not in use hold old values.
             used = used and node[b] >= grid.box[0, b] and node[b] < grid.box[0, b] + grid.box[1, b]
         held = 0.0
         if used:
-            held = grid.holding[grid.linear_index(node)][d] * share
-            if ti.static(len(grid.period.axes) > 0):
-                for images in range(1, ti.static(2**d)):
-                    image, exists = grid.period.image(node, images)
-                    if exists:
-                        held += grid.holding[grid.linear_index(image)][d] * share
+            held = grid.images.by_period.sum(grid.holding, d, grid, node, 1) * share
         least = ti.min(least, held)
     return least
-
-
-@ti.func
-def image_sum(
-    node: ti.template(), grid: ti.template(), last: ti.template(), reach: ti.template(), mirrors: ti.template()
-):
-    """Return the sum of the mass or volume of a node and its images beyond periodic faces and, with `mirrors`, walls.
-
-    A node on a wall, whose cell is half outside, counts twice, at an edge or corner of walls 4 or 8 times. All walls
-    have images here, whatever their condition. `reach` is the number of nodes inside a wall that have images.
-    """
-    d = ti.static(grid.dimension)
-    total = 0.0
-    for images in range(ti.static(2**d)):
-        place, exists = node, True
-        for a in ti.static(range(d)):
-            if images >> a & 1 == 1:
-                image, found = node[a], False
-                if ti.static(mirrors or a in grid.period.axes):
-                    image, found = image_along(node[a], a, grid, last, reach, 1)
-                place[a] = image
-                exists = exists and found
-        if exists:
-            total += grid.holding[grid.linear_index(place)][d]
-    return total
-
-
-@ti.func
-def image_along(
-    j: int, axis: ti.template(), grid: ti.template(), last: ti.template(), reach: ti.template(), n: ti.template()
-):
-    """Return the image of node j beyond the faces of an axis, or j if it has none, and whether it has one.
-
-    Args:
-        reach: number of nodes inside a wall that have images.
-        n: nodes per cell.
-    """
-    image, exists = j, True
-    first, end = ti.static(PAD * n), last[axis] * n
-    if ti.static(axis in grid.period.axes):
-        if j <= 2 * first:
-            image = j + end - first
-        elif j >= end - first:
-            image = j - end + first
-        else:
-            exists = False
-    elif j <= first + reach and ti.static((axis, 0) not in grid.opens):
-        image = 2 * first - j
-    elif j >= end - reach and ti.static((axis, 1) not in grid.opens):
-        image = 2 * end - j
-    else:
-        exists = False
-    return image, exists
