@@ -102,7 +102,8 @@ class TileOrder:
     @ti.func
     def wrap(self, p: int):
         """Wrap particle p into a periodic domain."""
-        self.grid.period.wrap(self.group, p)
+        if ti.static(len(self.grid.images.periodic) > 0):
+            self.grid.period.wrap(self.group, p)
 
     @ti.func
     def tile_of(self, p: int):
