@@ -200,12 +200,18 @@ class MirrorImages:
     @ti.func
     def owner(self, node: ti.template()):
         """Return the node inside the domain of which a node is the image, and 1 or -1 per component of its velocity."""
-        depth, mirror, _upper, acts, holds = self.walls.state(node, False)
-        beyond = 0
-        for i, a in ti.static(enumerate(self.walls.axes)):
-            if acts[a] == 1 and depth[a] < 0:
-                beyond += ti.static(2**i)
-        return self.image(node, mirror, beyond), self.signs(beyond, holds)
+        own, signs = node, ti.Vector.one(float, self.dimension)
+        if self.walls.near(node):
+            depth, mirror, _upper, acts, holds = self.walls.state(node, False)
+            beyond = 0
+            for i, a in ti.static(enumerate(self.walls.axes)):
+                if acts[a] == 1 and depth[a] < 0:
+                    own[a] = mirror[a]
+                    beyond += ti.static(2**i)
+            found = self.signs(beyond, holds)
+            for c in ti.static(range(self.dimension)):
+                signs[c] = found[c]
+        return own, signs
 
     @ti.func
     def signs(self, images: int, holds: ti.template()):
