@@ -1,30 +1,26 @@
-"""An operation on particles in one file, as docs/architecture.md says: each remembers its largest rate of strain."""
+"""An operation on particles and a field of them, see docs/architecture.md: each keeps its largest rate of strain."""
 
 from mpmcli.boundaries.feature import Feature, Phase
 from mpmcli.quick_taichi import ti
+from mpmcli.solver.particles.columns import ParticleField, fields_of
 from mpmcli.solver.particles.loop import Operation, Pass
 
 
 @ti.func
-def strain_rate(_at: ti.template(), _p: int, _dt: float, C: ti.template()):
-    """Return the norm of the rate of strain of a particle, 1/s."""
-    return (0.5 * (C + C.transpose())).norm()
+def raised(_at: ti.template(), _p: int, _dt: float, C: ti.template(), marked: float):
+    """Return the larger of the norm of the rate of strain of a particle, 1/s, and that which it kept."""
+    return ti.max((0.5 * (C + C.transpose())).norm(), marked)
 
 
-@ti.func
-def remember(at: ti.template(), p: int, _dt: float, rate: float):
-    """Keep the largest rate of a particle, by its id, because sorts move particles."""
-    own = at.w * ti.static(at.features.marker.count) + at.group.id[p]
-    at.features.marker.largest[own] = ti.max(at.features.marker.largest[own], rate)
+def fields_with_mark(group: object) -> tuple[ParticleField, ...]:
+    """Return the fields of particles, and one for the largest rate of strain, 1/s."""
+    return (*fields_of(group), ParticleField("marked", "marked", ()))
 
 
-@ti.data_oriented
 class Marker(Feature):
-    """The largest rate of strain of `count` particles per run, 1/s."""
-
-    def __init__(self, runs: int, count: int) -> None:
-        self.count, self.largest = count, ti.field(float, shape=runs * count)
+    """Marks particles with their largest rate of strain, 1/s."""
 
     def phases(self, **_how: bool) -> tuple[Phase, ...]:
-        passes = (Pass(strain_rate, {"rate": ()}, in_lanes=True), Pass(remember))
-        return (Phase("mark", "particles", "gather", body=Operation(reads=("C",), passes=passes)),)
+        keep = Pass(raised, {"marked": ()}, in_lanes=True)
+        mark = Operation(reads=("C", "marked"), passes=(keep,), writes=("marked",))
+        return (Phase("mark", "particles", "gather", body=mark),)

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import Any
 
 from mpmcli.validation.case import Case, Measure, Setting
-from mpmcli.validation.runs import Run, RunResult, runs_of
+from mpmcli.validation.runs import CaseRun, RunResult, runs_of
 
 
 class Invented(Case):
@@ -27,7 +27,7 @@ class Invented(Case):
 
 CASE = Invented()
 SINGLE = Setting(precision="f32")
-Law = Callable[[Run], float | None]
+Law = Callable[[CaseRun], float | None]
 
 
 def result(error: float, particles: int = 100, steps: int = 11, seconds: float = 1.0) -> RunResult:
@@ -36,12 +36,12 @@ def result(error: float, particles: int = 100, steps: int = 11, seconds: float =
     return RunResult("finished", "", values, particles=particles, steps=steps, seconds=seconds)
 
 
-def second_order(run: Run) -> float:
+def second_order(run: CaseRun) -> float:
     """The law that the case keeps, with any setting."""
     return 0.5 * (8 / run.n) ** 2
 
 
-def results(law: Law = second_order, level: str = "default") -> dict[Run, RunResult]:
+def results(law: Law = second_order, level: str = "default") -> dict[CaseRun, RunResult]:
     """Return the results of a level whose errors follow a law; None is a run that became unstable.
 
     A run takes n^2 particles, n + 1 steps and 1e-6 s for each particle-step but those of the first step.

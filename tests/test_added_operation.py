@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from added_operation import Marker
+from added_operation import Marker, fields_with_mark
 from scenes import block
 from solver_state import scene_of
 from test_batch import batch_of, outputs_of
@@ -14,6 +14,7 @@ from mpmcli.solver.engine import batch, kernel_store
 from mpmcli.solver.engine.compiled_kind import CompiledKind
 from mpmcli.solver.engine.run import build_run
 from mpmcli.solver.features import Features
+from mpmcli.solver.particles import arrays
 
 STEP, COUNT = 1e-3, 60
 # Sorts follow each other by about ten steps.
@@ -26,12 +27,13 @@ class WithMarker(Features):
 
     def __init__(self, kind: CompiledKind, backend: object, runs: int, *given: object) -> None:
         super().__init__(kind, backend, runs, *given)
-        self.marker = Marker(runs, FAR)
+        self.marker = Marker()
 
 
 @pytest.fixture(autouse=True)
 def added(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(batch, "Features", WithMarker)
+    monkeypatch.setattr(arrays, "fields_of", fields_with_mark)
     monkeypatch.setenv(kernel_store.SWITCH, "off")
 
 
@@ -43,6 +45,13 @@ def thrown(speed: float = FAST, *, precision: str = "f64", **solver: object) -> 
         bodies=[block("jelly", JELLY, [0.5, 0.12], [0.8, 0.42]) | {"velocity": [speed, -1.0]}],
         solver={"precision": precision} | solver,
     )
+
+
+def marks(made: batch.Batch) -> np.ndarray:
+    """Return the marks of the particles of each run, (runs, FAR), by id."""
+    arrays = made.device.groups[0]
+    ids, marked = (field.to_numpy().reshape(made.runs, -1)[:, :FAR] for field in (arrays.id, arrays.marked))
+    return np.take_along_axis(marked, ids.argsort(axis=1), axis=1)
 
 
 @pytest.mark.parametrize(
@@ -65,9 +74,11 @@ def test_a_marker_follows_the_largest_rate(backend_of: Callable, arch: str, thre
         found = run.groups[0].read()
         rate = np.linalg.norm(0.5 * (found["C"] + found["C"].transpose(0, 2, 1)), axis=(1, 2))
         largest[found["id"]] = np.maximum(largest[found["id"]], rate)
-    marked = run.batch.device.features.marker.largest.to_numpy()
     assert run.particle_count == FAR and largest.min() < 1.0 and largest.max() > 50.0
-    np.testing.assert_allclose(marked, largest, rtol=1e-12 if arch == "cpu" else 1e-5)
+    np.testing.assert_allclose(marks(run.batch)[0], largest, rtol=1e-12 if arch == "cpu" else 1e-5)
+    saved = run.save().arrays
+    np.testing.assert_array_equal(saved["neo_hookean.marked"], run.groups[0].arrays.marked.to_numpy())
+    assert not np.array_equal(saved["neo_hookean.id"][:FAR], np.arange(FAR))
 
 
 def test_runs_of_a_batch_have_markers_of_their_own(backend_of: Callable) -> None:
@@ -77,8 +88,8 @@ def test_runs_of_a_batch_have_markers_of_their_own(backend_of: Callable) -> None
     for scene in scenes:
         made = batch_of([scene], backend)
         outputs_of(made, [scene])
-        alone.append(made.device.features.marker.largest.to_numpy())
+        alone.append(marks(made)[0])
     together = batch_of(scenes, backend)
     outputs_of(together, scenes)
-    np.testing.assert_array_equal(together.device.features.marker.largest.to_numpy(), np.concatenate(alone))
+    np.testing.assert_array_equal(marks(together), alone)
     assert not np.array_equal(*alone)

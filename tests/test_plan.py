@@ -161,7 +161,7 @@ def test_a_scene_of_fluid_plans_nothing_of_other_laws(backend_of: Callable) -> N
     assert "body" not in mixed.laws[1].fields
     run = build_run(scene_with("fluid", "sand", "fluid"), backend)
     for group, law in zip(run.groups, mixed.laws, strict=True):
-        assert len(group.arrays.state) + len(group.arrays.labels) == len(law.fields)
+        assert len(group.arrays.moved) == len(law.fields)
         assert group.count == law.particles
 
 

@@ -11,7 +11,7 @@ from scenes import block, scene
 from test_batch import SCENES, scene_named
 from test_emitters import SPACING, jet_scene
 
-from mpmcli.boundaries.walls import REACH
+from mpmcli.boundaries.walls import IMAGE_DEPTH
 from mpmcli.errors import InputError
 from mpmcli.frames.frame import Frame
 from mpmcli.scene import Scene, sample_bodies
@@ -76,8 +76,8 @@ def test_what_particles_of_a_tile_write_is_reached(cells: int, kind: tuple[int, 
                 if repeats:
                     images += [node + cells] * (node <= 2 * PAD) + [node - cells] * (node >= last - PAD)
                 else:
-                    images += [2 * PAD - node] * (abs(node - PAD) <= REACH)
-                    images += [2 * last - node] * (abs(node - last) <= REACH)
+                    images += [2 * PAD - node] * (abs(node - PAD) <= IMAGE_DEPTH)
+                    images += [2 * last - node] * (abs(node - last) <= IMAGE_DEPTH)
                 assert {i // tile for i in images} <= set(reached.tolist())
 
 

@@ -21,7 +21,7 @@ MODULES = {
     "forces": {"solver.drive.expressions.TimeTables", "solver.drive.forces.GroupForce"},
     "moving walls": {"boundaries.walls.MovingFaces"},
     "periodic faces": {"solver.grid.period.Period"},
-    "shifts": {"solver.transfer.redistribution.FineGrid", "solver.transfer.redistribution.shift_lanes"},
+    "shifts": {"solver.grid.fine_grid.FineGrid", "solver.transfer.redistribution.fill_fine"},
     "bodies that separate": {f"solver.contact.{name}" for name in ("body_contact", "shared_field", "surfaces")},
     # Not asked for by the scene with features either.
     "grids of distances": {"boundaries.distances.GridDistance"},

@@ -9,7 +9,7 @@ from solver_state import bodies_of, scene_of
 
 from mpmcli.solver.engine.run import Run, build_run
 from mpmcli.solver.engine.run_state import Layout, RunState
-from mpmcli.solver.engine.step_size import HOLD, RISE, StepSize
+from mpmcli.solver.engine.step_size import HOLD_STEPS, RISE, StepSize
 from mpmcli.solver.transfer.splines import SPLINES, TransferScheme
 
 # So soft that nothing but gravity moves it.
@@ -76,13 +76,13 @@ def test_a_bound_rises_late_and_never_with_an_oscillation() -> None:
         step_size.limit_rise(run, bound)
         return run.held
 
-    seen = [after(1.0 + 0.2 * np.cos(angle)) for angle in 1.9 * np.arange(20 * HOLD)]
+    seen = [after(1.0 + 0.2 * np.cos(angle)) for angle in 1.9 * np.arange(20 * HOLD_STEPS)]
     assert min(seen) >= 0.8
-    assert np.ptp(seen[HOLD:]) < 1e-3
-    for n in range(2 * HOLD):
-        assert after(2.0) == seen[-1] or n >= HOLD
+    assert np.ptp(seen[HOLD_STEPS:]) < 1e-3
+    for n in range(2 * HOLD_STEPS):
+        assert after(2.0) == seen[-1] or n >= HOLD_STEPS
     assert run.held == 2.0
-    for _ in range(3 * HOLD):
+    for _ in range(3 * HOLD_STEPS):
         assert after(2.0 * RISE * 0.99) == 2.0
     assert after(1.0) == 1.0
 

@@ -208,6 +208,16 @@ def test_modules_say_what_they_are() -> None:
     assert not silent, f"without a docstring: {silent}"
 
 
+def test_functions_of_twelve_lines_say_what_they_do() -> None:
+    def silent(path: Path) -> Iterator[int]:
+        functions = (node for node in ast.walk(tree(path)) if isinstance(node, ast.FunctionDef))
+        yield from (
+            node.lineno for node in functions if node.end_lineno - node.lineno > 10 and not ast.get_docstring(node)
+        )
+
+    assert not offenders(silent)
+
+
 def test_every_imported_package_is_a_declared_dependency() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = {name: extra for name, extra in project["optional-dependencies"].items() if name != "test"}

@@ -14,19 +14,19 @@ from invented_case import CASE, SINGLE, results, second_order
 from mpmcli.bench.report import describe_machine
 from mpmcli.validation.case import KNOBS, Measure, Setting
 from mpmcli.validation.report import COURANT, LOOKS, Report, draw_case, write_report
-from mpmcli.validation.runs import Run, RunResult, variants
+from mpmcli.validation.runs import CaseRun, RunResult, variants
 
-LOST = [Run("invented", n, Setting(transfer="aflip")) for n in (8, 16, 32)] + [
-    Run("invented", 16, Setting(safety=0.95))
+LOST = [CaseRun("invented", n, Setting(transfer="aflip")) for n in (8, 16, 32)] + [
+    CaseRun("invented", 16, Setting(safety=0.95))
 ]
 
 
-def law(run: Run) -> float | None:
+def law(run: CaseRun) -> float | None:
     """The law of the case, but for a transfer and a Courant fraction that fail."""
     return None if run in LOST else second_order(run)
 
 
-def report_of(level: str, found: dict[Run, RunResult]) -> Report:
+def report_of(level: str, found: dict[CaseRun, RunResult]) -> Report:
     environment = {**describe_machine(), "workers": 2, "date": "2026-11-25"}
     return Report(level, environment, [CASE], found)
 

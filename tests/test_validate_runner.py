@@ -19,41 +19,41 @@ from mpmcli.solver.machine.backend import Backend
 from mpmcli.validation import runs as runs_module
 from mpmcli.validation.case import Measure, Setting
 from mpmcli.validation.cases import all_cases
-from mpmcli.validation.runs import Journal, Run, RunResult, carry_out, carry_out_all, run_key, runs_of
+from mpmcli.validation.runs import CaseRun, Journal, RunResult, carry_out, carry_out_all, run_key, runs_of
 
 RUNS = runs_of(CASE, "coarse")
 BAR = all_cases()["bar_fixed_free"]
-BAR_RUN = Run("bar_fixed_free", 13, Setting())
+BAR_RUN = CaseRun("bar_fixed_free", 13, Setting())
 # Nothing is ever computed on it.
 BACKEND = Backend("cpu", 1, "f64", True)
 
 
-def answers(run: Run) -> RunResult:
+def answers(run: CaseRun) -> RunResult:
     """Say something, which is no answer, and then answer."""
     print("noise", flush=True)
     return result(0.5)
 
 
-def dies(run: Run) -> RunResult:
+def dies(run: CaseRun) -> RunResult:
     """End the process of the run at n = 16."""
     if run.n == 16:
         os._exit(3)
     return result(0.5)
 
 
-def breaks(run: Run) -> RunResult:
+def breaks(run: CaseRun) -> RunResult:
     """Raise what no run should raise."""
     raise KeyError(run.n)
 
 
-def sleeps(run: Run) -> RunResult:
+def sleeps(run: CaseRun) -> RunResult:
     """Answer at n = 8, and never at another n."""
     if run.n != 8:
         time.sleep(600)
     return result(0.5)
 
 
-def counts(place: Path, run: Run) -> RunResult:
+def counts(place: Path, run: CaseRun) -> RunResult:
     """Tell how many of these processes there are when it starts and when it ends, at most."""
     mine = place / str(os.getpid())
     mine.touch()
@@ -87,7 +87,7 @@ def test_a_run_that_takes_too_long_is_ended() -> None:
 
 
 def test_no_more_run_at_a_time_than_asked_for(tmp_path: Path) -> None:
-    runs = [Run("invented", n, Setting()) for n in range(3)]
+    runs = [CaseRun("invented", n, Setting()) for n in range(3)]
     seen = [found.particles for _, found in carry_out_all(runs, workers=2, work=partial(counts, tmp_path))]
     assert len(seen) == 3 and max(seen) <= 2
 

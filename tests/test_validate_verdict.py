@@ -6,13 +6,17 @@ from hypothesis import strategies as st
 from invented_case import CASE, SINGLE, result, results, second_order
 
 from mpmcli.validation.case import Setting
-from mpmcli.validation.runs import Run, matrix, runs_of, variants
+from mpmcli.validation.runs import CaseRun, matrix, runs_of, variants
 from mpmcli.validation.verdict import judge, observed_order
 
 
 def test_coarse_is_the_default_setting_and_single_precision_at_the_finest() -> None:
     runs = runs_of(CASE, "coarse")
-    assert runs == [Run("invented", 8, Setting()), Run("invented", 16, Setting()), Run("invented", 16, SINGLE)]
+    assert runs == [
+        CaseRun("invented", 8, Setting()),
+        CaseRun("invented", 16, Setting()),
+        CaseRun("invented", 16, SINGLE),
+    ]
     assert len(matrix([CASE, CASE], "coarse")) == 6
 
 
@@ -48,7 +52,7 @@ def test_a_case_within_its_bounds_passes() -> None:
 @given(n=st.sampled_from([8, 16, 32]), factor=st.floats(0.01, 100.0))
 def test_a_bound_holds_or_fails_at_each_resolution(n: int, factor: float) -> None:
     """Errors are 5/6 of the bounds; one of them is multiplied."""
-    found = results(lambda run: second_order(run) * (factor if run == Run("invented", n, Setting()) else 1))
+    found = results(lambda run: second_order(run) * (factor if run == CaseRun("invented", n, Setting()) else 1))
     checks = {
         check.n: check.passed
         for check in judge(CASE, found).checks
@@ -80,13 +84,13 @@ def test_round_off_has_no_order() -> None:
 
 @given(ratio=st.floats(0.1, 10.0), error=st.floats(1e-6, 1e-1))
 def test_single_precision_may_add_rounding_or_a_fifth(ratio: float, error: float) -> None:
-    found = {Run("invented", 8, Setting()): result(error), Run("invented", 8, SINGLE): result(error * ratio)}
+    found = {CaseRun("invented", 8, Setting()): result(error), CaseRun("invented", 8, SINGLE): result(error * ratio)}
     checks = {check.subject: check for check in judge(CASE, found).checks if check.setting == SINGLE}
     assert set(checks) == {measure.name for measure in CASE.measures}
     check = checks["error"]
     assert check.figure == error * ratio
     assert check.passed == (error * ratio <= 1.2 * max(error, 1e-4))
-    verdict = judge(CASE, found).of_run(Run("invented", 8, SINGLE))
+    verdict = judge(CASE, found).of_run(CaseRun("invented", 8, SINGLE))
     assert verdict == ("pass" if all(check.passed for check in checks.values()) else "fail")
 
 
@@ -94,7 +98,7 @@ def test_single_precision_may_add_rounding_or_a_fifth(ratio: float, error: float
     ("setting", "passes"), [(Setting(), False), (SINGLE, False), (Setting(transfer="aflip"), True)]
 )
 def test_a_run_that_fails_counts_where_something_is_asked_of_it(setting: Setting, passes: bool) -> None:
-    lost = Run("invented", 16, setting)
+    lost = CaseRun("invented", 16, setting)
     verdict = judge(CASE, results(lambda run: None if run == lost else second_order(run)))
     assert verdict.word == ("pass" if passes else "fail")
     assert all("became unstable: It was <lost>." in reason for reason in verdict.reasons)

@@ -15,7 +15,7 @@ from mpmcli.materials.registry import parameter_models
 from mpmcli.scene import parse_scene, scene_to_toml
 from mpmcli.validation.case import KNOBS, Setting
 from mpmcli.validation.cases import all_cases
-from mpmcli.validation.runs import Run, RunResult, carry_out, scene_of
+from mpmcli.validation.runs import CaseRun, RunResult, carry_out, scene_of
 from mpmcli.validation.verdict import ROUND_OFF, judge
 
 CASES = all_cases()
@@ -70,14 +70,14 @@ def test_a_case_is_within_its_bounds(run_of: Callable, record_property: Callable
     result = run_of(name, n)
     for measure, value in result.values.items():
         record_property(measure, value)
-    assert judge(CASES[name], {Run(name, n, Setting()): result}).reasons == ()
+    assert judge(CASES[name], {CaseRun(name, n, Setting()): result}).reasons == ()
 
 
 @pytest.mark.parametrize(("name", "n", "finer"), PAIRS)
 def test_a_case_converges_as_it_should(
     run_of: Callable, record_property: Callable, name: str, n: int, finer: int
 ) -> None:
-    found = {Run(name, k, Setting()): run_of(name, k) for k in (n, finer)}
+    found = {CaseRun(name, k, Setting()): run_of(name, k) for k in (n, finer)}
     orders = [check for check in judge(CASES[name], found).checks if check.subject.startswith("order")]
     assert orders
     for check in orders:

@@ -15,7 +15,7 @@ from small_plants import SMALL_PLANTS, SmallPlant
 
 from mpmcli.validation.case import Setting
 from mpmcli.validation.cases import all_cases
-from mpmcli.validation.runs import Run, RunResult
+from mpmcli.validation.runs import CaseRun, RunResult
 from mpmcli.validation.verdict import judge
 
 FEWEST = 40
@@ -44,7 +44,7 @@ def first_run(package: Path, name: str) -> str:
     # A run may become unstable or give no number; any other failure would be a plant that does not even compile.
     assert result.status in ("finished", "unstable") or "came to its end" in result.message, result.message
     n = min(CASES[name].levels["coarse"])
-    return "; ".join(judge(CASES[name], {Run(name, n, Setting()): result}).reasons)
+    return "; ".join(judge(CASES[name], {CaseRun(name, n, Setting()): result}).reasons)
 
 
 @pytest.fixture(scope="module")

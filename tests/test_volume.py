@@ -8,7 +8,7 @@ import pytest
 from scenes import block, scene, volume_errors
 from scipy.stats import norm
 
-from mpmcli.materials.fluid import BESIDE, DEAD_BAND, FULL, LARGEST_LACK, OPENED, RELAXATION, SLACK, Fluid
+from mpmcli.materials.fluid import BESIDE, DEAD_BAND, FREE_DEAD_BAND, FULL, LARGEST_LACK, OPENED, RELAXATION, Fluid
 from mpmcli.materials.registry import parameter_models
 from mpmcli.materials.sand import BAND, Sand
 from mpmcli.materials.sand import RELAXATION as GRAINS_RELAXATION
@@ -160,8 +160,8 @@ def test_volume_follows_the_grid(
 ) -> None:
     """J += share sgn(g) max(|g| - band, 0), g = 1/sum(w n) - J, where all n > FULL; share = a/(1 + a), a = rate c t/h.
 
-    Down to J = 1 all of g - DEAD_BAND or g + SLACK instead, and below it at least to LARGEST_LACK less than 1/sum(w n)
-    or 1. It grows only where the nodes beside the stencil are filled, too.
+    Down to J = 1 all of g - DEAD_BAND or g + FREE_DEAD_BAND instead, and below it at least to LARGEST_LACK less than
+    1/sum(w n) or 1. It grows only where the nodes beside the stencil are filled, too.
 
     The same step without relaxation differs by that alone: positions, velocities and gradients have the same bytes.
     """
@@ -191,7 +191,7 @@ def test_volume_follows_the_grid(
     J = before["deformation"]
     moves = (least > FULL) & ((seen < J) | (beside * seen > BESIDE))
     gap = (seen - J) * moves
-    free = np.maximum(J + np.maximum(gap - DEAD_BAND, 0) + np.minimum(gap + SLACK, 0), 1)
+    free = np.maximum(J + np.maximum(gap - DEAD_BAND, 0) + np.minimum(gap + FREE_DEAD_BAND, 0), 1)
     free = np.where(J >= 1, free, J)
     gap = np.maximum(seen - free, np.minimum(1 - free, 0) - LARGEST_LACK) * moves
     gap = np.where(gap > 0, np.clip(seen - 1, 0, gap), gap)

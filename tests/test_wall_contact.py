@@ -12,7 +12,7 @@ from conftest import ROOT
 from contact_scenes import DENSITY, E, G, H, body, jelly, scene
 
 from mpmcli.check.collider_work import work_of_colliders
-from mpmcli.check.result_check import HELD, check_kept, energy_change
+from mpmcli.check.result_check import HELD_ENERGY, check_kept, energy_change
 from mpmcli.frames.frame import Frame
 from mpmcli.materials.registry import laws
 from mpmcli.output.header import RunHeader
@@ -391,7 +391,7 @@ def test_the_ledger_lacks_a_part_of_the_energy_of_contact(backend_of: Callable) 
     rows = [row for _, row in build_run(asked, backend_of("f64", 1)).frames()]
     parts = [np.array([getattr(row, name) for row in rows]) for name in ("kinetic", "potential", "elastic")]
     work = np.cumsum([row.contact_work for row in rows])
-    assert 1e-2 < energy_change(*parts)[0].max() < 0.8 * HELD
+    assert 1e-2 < energy_change(*parts)[0].max() < 0.8 * HELD_ENERGY
     assert energy_change(*parts, work)[0].max() < 1e-3
     assert work.min() < 0.0 and work.max() < 1e-3 * np.ptp(parts[2])
 

@@ -44,6 +44,7 @@ def run_bench(
 
 
 def _run_case(case: BenchCase, threads: int, arch: str, seconds: float, blocks: int) -> dict:
+    """Return the costs of all sides of a case, and the ratio of peer to mpmcli, measured in turn block by block."""
     makes = {"mpmcli": partial(block_of_ours, case, threads, arch), case.peer: partial(Peer, case, threads, arch)}
     if arch == "cpu" and has_compiler():
         makes[IN_C] = partial(Yardstick, case, threads)

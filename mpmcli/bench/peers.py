@@ -102,6 +102,7 @@ class Peer:
     """An example of the taichi package with the block of a case."""
 
     def __init__(self, case: BenchCase, threads: int, arch: str = "cpu", precision: str = "f32") -> None:
+        """Run the adapted example as a module, and set its particles to those of the case."""
         path = example_path(case.peer)
         source = adapted_source(path.read_text(encoding="utf-8"), case, threads, arch, precision)
         module, filename = ModuleType("taichi_example"), f"<{path.name} of bench>"

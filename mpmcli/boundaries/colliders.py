@@ -28,7 +28,7 @@ from mpmcli.scene.surface import form_surface, ring, surface_points
 # Distance in cells outside a surface up to which it acts on nodes. The outermost of these nodes lies between a quarter
 # of a cell inside and three quarters outside: then fluids neither enter nor lose pressure, and rough surfaces stick
 # (docs/theory.md, 3.8). A little more than 0.75, so that rounding does not matter for nodes at that distance.
-REACH = 0.76
+COLLIDER_REACH = 0.76
 # The same if the surface acts at its points (`contact.collider_points`): nodes this deep inside, and deeper, take part
 # in no point, and keep back what got in. At 0.6 to 0.76 cells nodes of little mass that are not held make jets, but
 # holding them would slow bodies that move freely. Nodes inside a surface that sticks follow the gradient of the
@@ -179,8 +179,8 @@ def reach_of(collider: Collider, h: float) -> np.ndarray:
     found = np.array([[-radius] * d, [radius] * d])
     if np.isfinite(radius) and not motion.turns and motion.angle == 0.0:
         found = np.array(collider.form.bounds()) - np.array(collider.center)
-    found[0] -= h * (REACH + 0.01)
-    found[1] += h * (REACH + 0.01)
+    found[0] -= h * (COLLIDER_REACH + 0.01)
+    found[1] += h * (COLLIDER_REACH + 0.01)
     return found
 
 
@@ -361,7 +361,7 @@ class Colliders(Feature):
         Also return the share of its kernel outside of colliders, see `free_share`.
         """
         d = ti.static(self.dimension)
-        result, x, free, held = ti.Vector.zero(float, d), self.place_of(node), 1.0, False
+        result, x, free, held = ti.Vector.zero(float, d), self.position_of(node), 1.0, False
         for a in ti.static(range(d)):
             result[a] = velocity[a]
         for k in range(self.count[self.run]):
@@ -396,7 +396,7 @@ class Colliders(Feature):
     @ti.func
     def free_share(self, node: ti.template(), spline: ti.template()):
         """Return the share of the kernel of a node that is outside of colliders which do not hold."""
-        x, free = self.place_of(node), 1.0
+        x, free = self.position_of(node), 1.0
         for k in range(self.count[self.run]):
             i = self.run * self.capacity + k
             if self.wall[i] != HOLD and self.covers(i, x, self.beyond()):
@@ -409,7 +409,7 @@ class Colliders(Feature):
     @ti.func
     def beyond(self):
         """Return how far beyond its reach a collider cuts the kernels of nodes, m."""
-        return ti.static(max(self.support - REACH, 0.0)) * self.spacing
+        return ti.static(max(self.support - COLLIDER_REACH, 0.0)) * self.spacing
 
     @ti.func
     def arm_now(self, i: int, arm: ti.template()):
@@ -423,7 +423,7 @@ class Colliders(Feature):
     def acts_by_points(self, i: int, arm: ti.template(), face: int, phi: float, normal: ti.template()):
         """Return whether the surface of collider i acts at its points near a node at the distance phi, m."""
         result, h = self.wall[i] != HOLD, self.spacing
-        if self.slender[i] == 1 and ti.abs(phi) <= REACH * h:
+        if self.slender[i] == 1 and ti.abs(phi) <= COLLIDER_REACH * h:
             below, _normal = self.distance(i, arm - (phi + PROBE * h) * normal, face)
             result = result and below <= -WITHIN * h
         return result
@@ -431,11 +431,11 @@ class Colliders(Feature):
     @ti.func
     def reach_of_surface(self, i: int, pointed: bool):
         """Return the distance outside its surface up to which collider i acts on nodes, m."""
-        reach = self.deep[i] if pointed else REACH
+        reach = self.deep[i] if pointed else COLLIDER_REACH
         return ti.select(self.wall[i] == HOLD, HELD_OUTSIDE, reach) * self.spacing
 
     @ti.func
-    def place_of(self, node: ti.template()):
+    def position_of(self, node: ti.template()):
         """Return the position of a node relative to the lower corner, m."""
         x = ti.Vector.zero(float, self.dimension)
         for a in ti.static(range(self.dimension)):
@@ -662,6 +662,7 @@ class ColliderMotion(Feature):
     begins = True
 
     def __init__(self, colliders: Colliders, runs: int) -> None:
+        """Allocate poses and rates of the moving colliders of a number of runs, and on the CPU their work."""
         d = colliders.dimension
         self.colliders, self.dimension, self.moving = colliders, d, colliders.kind.moving
         n = runs * len(self.moving)

@@ -170,6 +170,7 @@ class CapsuleDistance(Distance):
 
     @ti.func
     def at(self, numbers: ti.template(), first: int, y: ti.template()):
+        """Return the distance to the point of the segment that is nearest to y, less the radius, m, and the normal."""
         d = ti.static(self.dimension)
         along, length = 0.0, 0.0
         for a in ti.static(range(d)):
@@ -192,6 +193,7 @@ class CylinderDistance(Distance):
 
     @ti.func
     def at(self, numbers: ti.template(), first: int, y: ti.template()):
+        """Return the larger of the distances to side and ends, m, beside both that to the rim, and the normal."""
         offset = y
         axis = y
         along = 0.0
@@ -224,6 +226,7 @@ class PolygonDistance(Distance):
 
     @ti.func
     def at(self, numbers: ti.template(), first: int, y: ti.template()):
+        """Return the distance to the nearest edge, m, negative inside by the crossings of a ray, and the normal."""
         count = ti.cast(numbers[first], int)
         square, inside, beside = 1e30, False, False
         nearest = y

@@ -34,9 +34,12 @@ class Phase:
         adds: whether particles add to nodes; without atomics this is done colour by colour of pencils.
         turns: number of repetitions, with `turn` counting from 0.
         rounds: number of times that all turns are repeated.
-        body: function of one node or particle on any device: body(at, node, kick), body(at, particle, step), or in a
-            shift body(at, node or particle, time over which volumes relax); or an `Operation` on particles
-            (`solver.particles.loop`).
+        body: function of one node or particle on any device, body(at, node or particle, time), or an `Operation` on
+            particles (`solver.particles.loop`).
+        time: the number of the step that a body takes: "kick" for nodes and "dt" for particles if none is named, and
+            in a shift "relaxed".
+        relaxes: whether only steps that relax volumes carry it out, as those of a shift.
+        most: the number of the step, one per group, that keeps the largest value of an operation; "" if none does.
         wanted: function of the first node of a row on a dense grid on the CPU, which returns whether the row has work:
             wanted(at, node). Such phases have work in layer 0 alone.
         part, item: for phases with a division of work of their own, functions of a part of all items on the CPU,
@@ -53,6 +56,9 @@ class Phase:
     turns: int = 1
     rounds: int = 1
     body: Any = None
+    time: Literal["", "dt", "kick", "relaxed"] = ""
+    relaxes: bool = False
+    most: Literal["", "rate", "volume_change"] = ""
     wanted: Callable | None = None
     part: Callable | None = None
     item: Callable | None = None
@@ -62,6 +68,11 @@ class Phase:
     def shifts(self) -> bool:
         """Whether the phase belongs to the shift of particles."""
         return self.stage == "shift"
+
+    @property
+    def duration(self) -> str:
+        """The name of the number of a step that a body takes."""
+        return self.time or ("relaxed" if self.shifts else "kick" if self.over == "nodes" else "dt")
 
 
 class Feature:

@@ -8,7 +8,7 @@ second-order accurate; setting nodal velocities to zero is first-order accurate 
 from collections.abc import Sequence
 from copy import copy
 
-from mpmcli.boundaries.walls import AWAY, REACH, Walls
+from mpmcli.boundaries.walls import AWAY, IMAGE_DEPTH, Walls
 from mpmcli.quick_taichi import ti
 from mpmcli.scene.domain import SEPARATING
 
@@ -38,6 +38,7 @@ class MirrorImages:
     """
 
     def __init__(self, walls: Walls, on_node: float, *, on_cpu: bool) -> None:
+        """Store the mirrors; `on_node` is the weight of the spline at a node for a point on it."""
         self.walls = walls
         self.dimension = walls.dimension
         self.needs_contact = len(walls.separating) > 0
@@ -65,7 +66,7 @@ class MirrorImages:
         images = copy(self)
         images.walls = copy(self.walls)
         if images.walls.shut == 0:
-            images.walls.shut = -REACH * ti.min(layer, 1)
+            images.walls.shut = -IMAGE_DEPTH * ti.min(layer, 1)
         images.walls.first_plane = self.walls.first_plane + layer * len(self.walls.separating)
         images.walls.first_rough = self.walls.first_rough + layer * len(self.walls.rough)
         return images
@@ -327,7 +328,7 @@ class MirrorImages:
                     acts = ti.Vector.zero(int, self.dimension)
                     for b in ti.static(self.walls.lateral[axis]):
                         separates = self.walls.face_in(SEPARATING, b, upper_side[b])
-                        acts[b] = ti.cast(depth[b] <= REACH and not separates, int)
+                        acts[b] = ti.cast(depth[b] <= IMAGE_DEPTH and not separates, int)
                     holds = self.walls.holding(node, depth, upper_side, False)
                     value = self.image_sum(grid, 0, node, mirror, acts, depth, holds, upper_side, gravity_step)
                 outward = value[axis]

@@ -27,28 +27,28 @@ from mpmcli.scene.primitives import Ball
 # largest number of sweeps; largest change of an impulse in a sweep, over the largest impulse, at which sweeps end.
 NEAR, UNDONE, SWEEPS, ENOUGH = 0.6, 0.2, 50, 1e-6
 # Smallest change of velocity by an impulse, over that of the free body, at which a point is pushed.
-LEAST = 1e-9
+LEAST_YIELDING = 1e-9
 # Number of iterations for the point of a ball that faces an obstacle.
 LOOKS = 2
 # Coefficient of friction of sticking surfaces; codes of a wall and of no obstacle in place of the index of a collider.
 STUCK = 1e3
-WALL, NOTHING = -1, -2
+WALL, NO_OBSTACLE = -1, -2
 # Results of `look_at_all` other than a number of parts.
 CLEAR, CLOSE = 0.0, 0.5
 # Rebound of a point that may pass a surface in this step and separates from it in the next.
 LATER = -1.0
 # Turns of the phase that moves bodies: they take the momentum from nodes, and move, while their contact is resolved.
-MOVES = 2
+MOVE_TURNS = 2
 # Distance in cells by which a point approaches a surface and angle, rad, by which its body turns in a part of a step;
 # largest number of parts.
-PART_WAY, PART_TURN, MOST_PARTS = 1 / 16, 2 * math.pi / 50, 32
+PART_WAY, PART_TURN, MOST_STEP_PARTS = 1 / 16, 2 * math.pi / 50, 32
 
 
 @ti.func
 def move_part(phases: ti.template(), at: ti.template()):
     """Carry out a turn on the CPU, in one thread of a run."""
     if at.region == 0 and at.part == 0:
-        for turn in ti.static(range(MOVES)):
+        for turn in ti.static(range(MOVE_TURNS)):
             if at.turn == turn:
                 move_bodies(phases, at, turn)
 
@@ -71,7 +71,7 @@ def move_bodies(phases: ti.template(), at: ti.template(), turn: ti.template()):
         done, parts = 0, 1
         # Written so that a NaN is no number of parts.
         if found > 1:
-            parts = ti.cast(ti.ceil(ti.min(found, MOST_PARTS)), int)
+            parts = ti.cast(ti.ceil(ti.min(found, MOST_STEP_PARTS)), int)
         part = whole / parts
         while done < parts:
             if parts > 1:
@@ -93,6 +93,7 @@ class RigidContact(Feature):
     """Contact of the bodies of some runs; `faces` are the conditions of the walls, `capacity` the points of a run."""
 
     def __init__(self, bodies: RigidBodies, faces: tuple[tuple[str, str], ...], runs: int) -> None:
+        """Allocate the points and balls of a number of runs, and number the bodies among their colliders."""
         d, self.bodies, self.dimension = bodies.dimension, bodies, bodies.dimension
         self.capacity = bodies.colliders.kind.points
         self.walls = tuple((a, side) for a in range(d) for side in (0, 1) if faces[a][side] != OPEN)
@@ -130,7 +131,7 @@ class RigidContact(Feature):
         self._balls.write(run * self.bodies.count, radii)
         found = [contact_points(one, scene.domain.spacing) for one in free]
         points = np.concatenate(found)
-        own, none = np.repeat(np.arange(len(found)), [len(one) for one in found]), np.full(len(points), NOTHING)
+        own, none = np.repeat(np.arange(len(found)), [len(one) for one in found]), np.full(len(points), NO_OBSTACLE)
         self._points.write(run * self.capacity, own, points, none, np.zeros_like(points))
         words, frictions = scene.domain.walls.faces(self.dimension), scene.domain.frictions
         faces = np.zeros((self.dimension, 2))
@@ -142,7 +143,7 @@ class RigidContact(Feature):
         return {"rigid.other": self.other, "rigid.impulse": self.impulse}
 
     def phases(self, **_how: bool) -> tuple[Phase, ...]:
-        how = {"turns": MOVES, "part": move_part, "item": move_item}
+        how = {"turns": MOVE_TURNS, "part": move_part, "item": move_item}
         return (Phase("move_bodies", "runs", "move", **how, words="move rigid bodies"),)
 
     @ti.func
@@ -195,12 +196,12 @@ class RigidContact(Feature):
         b = run * self.bodies.count + self.body[q]
         own = self.bodies.numbers[self.body[q]]
         arm, normal = self.bodies.turned(b) @ self.point[q], ti.Vector.zero(ti.f64, d)
-        gap, other, friction = ti.cast(0, ti.f64), NOTHING, 0.0
+        gap, other, friction = ti.cast(0, ti.f64), NO_OBSTACLE, 0.0
         tries = 1
         if self.ball[b] > 0:
             tries += LOOKS
         for k in range(tries):
-            if k > 0 and other != NOTHING:
+            if k > 0 and other != NO_OBSTACLE:
                 # The point of a ball that faces the obstacle.
                 for a in ti.static(range(d)):
                     arm[a] = -self.ball[b] * normal[a]
@@ -215,14 +216,14 @@ class RigidContact(Feature):
         if self.other[q] != other:
             pressed = ti.cast(0, ti.f64)
         after = pressed * normal + self.rubbed(q, self.impulse[q] - self.impulse[q].dot(normal) * normal, pressed)
-        self.meets[q], self.other[q], self.gap[q] = ti.cast(other != NOTHING, int), other, gap
+        self.meets[q], self.other[q], self.gap[q] = ti.cast(other != NO_OBSTACLE, int), other, gap
         for a in ti.static(range(d)):
             self.normal[q][a], self.impulse[q][a] = normal[a], after[a]
         self.rebound[q] = 0
         found = ti.cast(CLEAR, ti.f64)
-        if other != NOTHING:
+        if other != NO_OBSTACLE:
             found = CLOSE
-        if other != NOTHING and pressed == 0:
+        if other != NO_OBSTACLE and pressed == 0:
             bounces = self.restitution[run * colliders.capacity + own]
             if other >= 0:
                 bounces = ti.max(bounces, self.restitution[run * colliders.capacity + other])
@@ -262,7 +263,7 @@ class RigidContact(Feature):
         x, normal = arm, ti.Vector.zero(ti.f64, d)
         for a in ti.static(range(d)):
             x[a] += self.bodies.pose[b, a]
-        gap, other, friction = ti.cast(NEAR * colliders.spacing, ti.f64), NOTHING, 0.0
+        gap, other, friction = ti.cast(NEAR * colliders.spacing, ti.f64), NO_OBSTACLE, 0.0
         for a, side in ti.static(self.walls):
             away = x[a] if ti.static(side == 0) else ti.cast(extent[a], ti.f64) - x[a]
             if away < gap:
@@ -325,7 +326,7 @@ class RigidContact(Feature):
         # In a loop, so that it is compiled once.
         for k in range(2 if speed > 0 and self.friction[q] > 0 else 1):
             yielding = self.yielding(run, q, normal if k == 0 else slide / speed)
-            if yielding > LEAST * free:
+            if yielding > LEAST_YIELDING * free:
                 if k == 0:
                     pressed = ti.max(old + (wanted - along) / yielding, 0.0)
                 else:

@@ -18,7 +18,7 @@ from mpmcli.scene import Scene
 from mpmcli.scene.rigid import Hinge
 
 # Angle of a substep of the rotation in a step, rad, and largest number of substeps.
-PART, MOST_PARTS = 1e-3, 100.0
+SUBSTEP_ANGLE, MOST_SUBSTEPS = 1e-3, 100.0
 # Size of a position, m, or angle, rad, from which a pose counts as not finite.
 FAR = 1e30
 
@@ -55,6 +55,7 @@ class RigidMotion(Feature):
     """
 
     def __init__(self, colliders: Colliders, pushes: object, runs: int) -> None:
+        """Allocate the state of the free colliders of a number of runs, nearly all in double precision."""
         self.pushes = pushes
         self.colliders, self.dimension, self.free = colliders, colliders.dimension, colliders.kind.free
         self.loads, self.turns, self.run = colliders.loads.width, 1 if colliders.dimension == 2 else 3, 0
@@ -193,7 +194,7 @@ class RigidMotion(Feature):
         """Rotate body b about its centre in dt seconds, at constant angular momentum, or spin if that is constrained.
 
         In 3D an unconstrained rotation takes substeps, each of rotations about the principal axes in sequence
-        (Dullweber, Leimkuhler and McLachlan 1997): the energy oscillates by the square of the angle PART, and does not
+        (Dullweber, Leimkuhler and McLachlan 1997): the energy oscillates by the square of SUBSTEP_ANGLE, without
         drift.
         """
         if ti.static(self.dimension == 2):
@@ -203,7 +204,7 @@ class RigidMotion(Feature):
             momentum = ti.Vector([self.momentum[b, 3 + a] for a in range(3)])
             for a in ti.static(range(3)):
                 square += self.rate[b, 3 + a] ** 2
-            parts = ti.cast(ti.min(ti.sqrt(square) * dt / PART, MOST_PARTS), int) + 1
+            parts = ti.cast(ti.min(ti.sqrt(square) * dt / SUBSTEP_ANGLE, MOST_SUBSTEPS), int) + 1
             if self.spins[b] == 0:
                 parts = 0
                 half = 0.5 * dt * ti.sqrt(square)

@@ -56,6 +56,7 @@ class Rows:
 
     @ti.func
     def _set(self, field: ti.template(), row: int, table: ti.template(), line: int, column: ti.template()):
+        """Set a row of a field to the numbers of a line of a table from `column` on, entry by entry."""
         d = ti.static(len(field.shape))
         place = ti.Vector.zero(int, d)
         for q in range(ti.static(math.prod(field.shape[1:]))):

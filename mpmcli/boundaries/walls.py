@@ -19,7 +19,7 @@ from mpmcli.scene.domain import OPEN, SEPARATING, STICKING
 from mpmcli.scene.schema import SolverSettings
 
 # Nodes on each side of a wall that can hold mass from particles of the other side.
-REACH = 2
+IMAGE_DEPTH = 2
 # Entry of `Walls.contact` where the material has yet to reach the wall (docs/theory.md, 3.2).
 AWAY = -1
 
@@ -113,7 +113,7 @@ class Walls(Images):
         slip: per axis, the velocity of the face, (d, d), m/s, a variable of a kernel that replaces that of `moving`
             if `slips`, see `slipping`.
         shut: depth at and below which velocities out through a separating wall that does not act are zero, a number or
-            a variable of a kernel: 0, or -REACH where bodies touch the wall by their surfaces (`contact.obstacles`).
+            a variable of a kernel: 0, or -IMAGE_DEPTH where bodies touch the wall by their surfaces (`Obstacles`).
     """
 
     def __init__(
@@ -128,7 +128,7 @@ class Walls(Images):
     ) -> None:
         """Allocate one set of planes in `contact` and `impulse` for each run."""
         super().__init__(faces, first, [first + n for n in cells])
-        self.reach = first if self.periodic else REACH
+        self.reach = first if self.periodic else IMAGE_DEPTH
         self.moving, self.moves, self.slips = moving, len(moving.faces) > 0, False
         self.shut = 0
         self.separating = tuple(
@@ -211,11 +211,11 @@ class Walls(Images):
     def place(self, node: ti.template()):
         """Return, per axis, the depth of the node inside a wall within reach, its mirror, and 1 for the upper wall.
 
-        See `image_along`; the depth is REACH + 1 if no wall is within reach.
+        See `image_along`; the depth is IMAGE_DEPTH + 1 if no wall is within reach.
         """
-        depth, mirror, upper = ti.Vector([REACH + 1] * self.dimension), node, ti.Vector.zero(int, self.dimension)
+        depth, mirror, upper = ti.Vector([IMAGE_DEPTH + 1] * self.dimension), node, ti.Vector.zero(int, self.dimension)
         for a in ti.static(self.axes):
-            image, deep, side = self.image_along(node[a], a, REACH, 1)
+            image, deep, side = self.image_along(node[a], a, IMAGE_DEPTH, 1)
             mirror[a], depth[a], upper[a] = image, deep, side
         return depth, mirror, upper
 
@@ -225,14 +225,14 @@ class Walls(Images):
         acts = ti.Vector.zero(int, self.dimension)
         inner = node
         for a in ti.static(self.axes):
-            acts[a] = ti.cast(depth[a] <= REACH, int)
+            acts[a] = ti.cast(depth[a] <= IMAGE_DEPTH, int)
             if depth[a] < 0:
                 inner[a] = mirror[a]
         # Contact is looked up at the image inside the domain, so that a node and all its images agree.
         for f in ti.static(range(len(self.separating))):
             axis = ti.static(self.separating[f][0])
             if ti.static(axis in self.axes):
-                if depth[axis] <= REACH and upper[axis] == self.separating[f][1]:
+                if depth[axis] <= IMAGE_DEPTH and upper[axis] == self.separating[f][1]:
                     acts[axis] = self.contact[self.first_plane + f, self.plane_index(inner, axis)]
         return acts
 
@@ -275,7 +275,7 @@ class Walls(Images):
         if ti.static(rubbed):
             for r, _number, axis, side in ti.static(self.rough):
                 if ti.static(axis in self.axes):
-                    if depth[axis] <= REACH and upper[axis] == side:
+                    if depth[axis] <= IMAGE_DEPTH and upper[axis] == side:
                         entry = self.impulse[self.first_rough + r, self.plane_index(node, axis)][axis]
                         holds[axis] = ti.cast(entry, int)
         return holds
@@ -290,7 +290,7 @@ class Walls(Images):
                 for c in ti.static(range(self.dimension)):
                     result[a, c] = own[c]
         for r, _number, axis, side in ti.static(self.rough):
-            if depth[axis] <= REACH and upper[axis] == side and holds[axis] == 1:
+            if depth[axis] <= IMAGE_DEPTH and upper[axis] == side and holds[axis] == 1:
                 entry = self.impulse[self.first_rough + r, self.plane_index(node, axis)]
                 for c in ti.static(self.lateral[axis]):
                     result[axis, c] = entry[c]

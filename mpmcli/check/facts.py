@@ -84,6 +84,7 @@ class SceneFacts:
     """
 
     def __init__(self, scene: Scene) -> None:
+        """Compute the bounds of the scene as a whole and the limits on its step, s."""
         self.scene, self.contacts = scene, ContactTable(scene)
         self.starts = starts_of(scene)
         self.deformed = any(start.bound != StateBound() for start in self.starts)

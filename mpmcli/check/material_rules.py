@@ -73,6 +73,7 @@ def _impact(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
 
 
 def _soft(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
+    """Yield a warning if the weight of a solid body, Pa at its foot, exceeds SOFT times its modulus."""
     modulus = getattr(body.body.material, "youngs_modulus", body.stiffness)
     if body.law.deformation == "J" or not isinstance(modulus, int | float):
         return
@@ -115,6 +116,7 @@ def _friction(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
 
 
 def _density(facts: SceneFacts) -> Iterator[Finding]:
+    """Yield a warning if the densities of two bodies differ by more than the factor DENSITY_RATIO."""
     if not facts.bodies:
         return
     light = min(facts.bodies, key=lambda body: body.body.material.density)

@@ -62,7 +62,7 @@ ENERGY_SUSPECT, ENERGY_WRONG = 1e-2, 1e-1
 PASSING, BRIEF = 3e-2, 20
 # Growth that is allowed in addition after a minimum at which contact holds energy, which is not in the sum. A block of
 # jelly of 10 cells that rests on a floor has up to 0.045.
-HELD = 6e-2
+HELD_ENERGY = 6e-2
 # Masses are summed in double precision and never change.
 MASS_ERROR = 1e-9
 # Relative difference between the volume that liquids and grains fill and that of their particles, in every frame of the
@@ -166,6 +166,7 @@ def check_kept(header: RunHeader, frames: Sequence[Frame] | None, ledger: Sequen
 
 
 def _check(opened: OpenedResult, findings: FrameFindings, stop: Callable[[], bool] = lambda: False) -> ResultCheck:
+    """Return the check of an opened result: the order of its frames, their particles, and the ledger."""
     check_order(opened, findings)
     # Frames first: of a fault that both have, theirs names the particle.
     kept = bool(opened.entries) and opened.entries[0].read is not None
@@ -278,7 +279,7 @@ def check_ledger(entries: Sequence[Entry], header: RunHeader, findings: FrameFin
     if "contact_work" in of:
         # Contact takes energy up and returns it. All else is known with the work of contact.
         rest, _, stays = energy_change(*energies, work + unsure + np.cumsum(of["contact_work"]))
-        growth, lasting = np.maximum(rest, growth - HELD), np.maximum(stays, lasting - HELD)
+        growth, lasting = np.maximum(rest, growth - HELD_ENERGY), np.maximum(stays, lasting - HELD_ENERGY)
     if not balanced:
         what = (
             "Forces, walls that move, or a gravity that depends on time or acts along a periodic axis do work, so that "

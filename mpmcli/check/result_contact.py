@@ -104,6 +104,7 @@ class ContactCheck(FrameCheck):
     """Follows elastic bodies where they touch obstacles at rest, and the energy of meetings (docs/theory.md, 9.3)."""
 
     def __init__(self, header: RunHeader, findings: FrameFindings) -> None:
+        """Prepare to follow elastic bodies; none are if the header lacks what this needs, or something moves them."""
         super().__init__(header, findings)
         colliders = header.read_colliders({})
         unknown = any(one is None for one in (header.spacing, header.gravity, header.origin, *colliders))
@@ -140,6 +141,7 @@ class ContactCheck(FrameCheck):
         self._frames.append((bodies, impulses, work, row))
 
     def _body(self, frame: Frame, m: np.ndarray, rows: np.ndarray, label: int, boxes: dict, row: LedgerRow) -> _Body:
+        """Return the motion of a body in a frame, what is near it, and the obstacle if it touches one plane alone."""
         header, reach = self._header, NEAR * self._header.spacing
         x, v, mass = frame.position[rows].astype(np.float64), frame.velocity[rows].astype(np.float64), float(m.sum())
         x = x[0] + nearest_image(x - x[0], header.period)
@@ -207,6 +209,7 @@ class ContactCheck(FrameCheck):
             self._meetings()
 
     def _sliding(self, label: int, name: str, slide: _Slide) -> None:
+        """Report a slide at less friction than is given, and a spin that the force of the obstacle does not explain."""
         header, mu = self._header, slide.body.obstacle.friction
         body, kind = header.body_name(label), f"{label} {name}"
         cells, least = float(np.linalg.norm(slide.way)) / header.spacing, SHARE * slide.moved / header.spacing

@@ -20,7 +20,7 @@ CRUSHED, BLOWN_UP = 0.1, 10.0
 # a body that is reported.
 COMPRESSED, MUCH = 0.9, 0.01
 # Fraction of the particles of a frame on walls that is reported; bodies on the updated grid have none.
-HELD = 0.01
+ON_WALLS = 0.01
 # On a GPU the Courant number is estimated between measurements, during which an impact may double the speed.
 GPU_FACTOR = 2.0
 # Distance from a wall, in cells, from which on it does not act: a particle acts on nodes up to 1.5 cells away, and the
@@ -104,7 +104,7 @@ class StateCheck(FrameCheck):
         error = 4 * header.place_error(frame.position.dtype)
         held = int(((out >= 0) & (out <= error) & ~header.periodic).any(1).sum())
         opened = any(header.open_axes)
-        if frame.index > 0 and not opened and held > HELD * len(out):
+        if frame.index > 0 and not opened and held > ON_WALLS * len(out):
             what = f"In frame {frame.index} {held} of {counted(len(out), 'particle')} lie on a wall"
             what += ", where the domain keeps particles that would leave it: the rest of their displacement is lost"
             fix = 'With solids = "total" a stiffer material deforms less; "updated" keeps particles away from walls.'
@@ -123,6 +123,7 @@ class StateCheck(FrameCheck):
             self._tell("error", "escaped", frame, p, what, fix, float(beyond[p]))
 
     def _volumes(self, frame: Frame) -> None:
+        """Report the first particle without volume, and the crushed and the blown-up one of the largest |log J|."""
         J = volume_ratio(self._header, frame)
         if J is None or len(J) == 0 or (J.min() >= COMPRESSED and J.max() <= BLOWN_UP):
             self._since = {}

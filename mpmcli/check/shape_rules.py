@@ -28,13 +28,13 @@ from mpmcli.scene.surface import form_surface, surface_points
 # nodes wide, so that with three cells one row of particles is not affected by the surface (tests/hard_cases, H12).
 FEWEST_CELLS = 3.0
 # Distance, in cells, below which two particles always share a node, by kernel.
-REACH = {"quadratic": 2.0, "cubic": 3.0}
+COUPLED_WITHIN = {"quadratic": 2.0, "cubic": 3.0}
 # Laws of solids without a surface of their own.
 WELDING = ("snow", "von_mises")
 # Distance, in cells, below which a gap counts as intended contact.
 TOUCHING = 0.1
 # Distance, in cells, below which a wall acts on a body.
-WALL_REACH = 1.0
+WALL_MARGIN = 1.0
 # Particles per axis of a cell. Below two, stretched matter tears (numerical fracture) and sums over particles are poor
 # quadratures; above four, the cost grows without a gain in accuracy.
 FEWEST_PER_AXIS, MOST_PER_AXIS = 2, 4
@@ -65,6 +65,7 @@ def shape_findings(facts: SceneFacts) -> Iterator[Finding]:
 
 
 def _thin(facts: SceneFacts) -> Iterator[Finding]:
+    """Yield bodies that are thinner than FEWEST_CELLS cells."""
     h = facts.scene.domain.spacing
     for body in facts.bodies:
         cells = body.thickness / h
@@ -80,9 +81,10 @@ def _thin(facts: SceneFacts) -> Iterator[Finding]:
 
 
 def _gaps(facts: SceneFacts) -> Iterator[Finding]:
+    """Yield pairs of bodies with a gap between them, across which they already act on each other."""
     h, table = facts.scene.domain.spacing, facts.contacts
     bodies, fields = facts.scene.bodies, table.numbers
-    reach = REACH[facts.scene.solver.kernel]
+    reach = COUPLED_WITHIN[facts.scene.solver.kernel]
     for i, j, distance in close_pairs(facts.scene, [body.shape.form for body in bodies], reach * h):
         cells = distance / h
         first, second = bodies[i], bodies[j]
@@ -104,7 +106,7 @@ def _sticking(facts: SceneFacts) -> Iterator[Finding]:
     elastic = [source.name for source in scene.sources if source.has_surface]
     if not elastic or scene.contact.default != "auto" or table.parts or scene.contact.pairs:
         return
-    reach = REACH[scene.solver.kernel]
+    reach = COUPLED_WITHIN[scene.solver.kernel]
     if len(elastic) > 1:
         how = f"share one velocity field: they act on each other within {reach:g} cells, and do not slide on each other"
         if scene.solver.solids == "total":
@@ -130,6 +132,7 @@ def _welding(facts: SceneFacts) -> Iterator[Finding]:
 
 
 def _walls(facts: SceneFacts) -> Iterator[Finding]:
+    """Yield bodies that do not touch a wall, but begin so near that it acts on them."""
     domain = facts.scene.domain
     h = domain.spacing
     for body in facts.bodies:
@@ -139,14 +142,15 @@ def _walls(facts: SceneFacts) -> Iterator[Finding]:
             gaps = {f"{axis}_min": lower[a] - domain.origin[a], f"{axis}_max": domain.upper[a] - upper[a]}
             for (face, gap), word in zip(gaps.items(), words[a], strict=True):
                 meets = word in SEPARATING and facts.contacts.separates(body.body)
-                if not meets and not domain.periodic[a] and 1e-3 < gap / h < WALL_REACH * (1 - 1e-6):
+                if not meets and not domain.periodic[a] and 1e-3 < gap / h < WALL_MARGIN * (1 - 1e-6):
                     begins = f'Body "{body.name}" begins {gap / h:.2g} cells from the wall {face}'
                     what = f"{begins}, which already acts on it."
-                    fix = f"Let it touch the wall, or set it {WALL_REACH * h:.3g} m or more from it."
+                    fix = f"Let it touch the wall, or set it {WALL_MARGIN * h:.3g} m or more from it."
                     yield Finding("note", "wall-margin", what, fix, float(gap / h), body.name)
 
 
 def _particles(facts: SceneFacts) -> Iterator[Finding]:
+    """Yield bodies with too few particles per cell for large stretch, or more than the grid can use."""
     d = facts.scene.dimension
     fewest, most = FEWEST_PER_AXIS**d, MOST_PER_AXIS**d
     for body in facts.bodies:

@@ -170,6 +170,7 @@ def _viscosity(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
 
 
 def _impact(facts: SceneFacts, body: BodyFacts) -> Iterator[Finding]:
+    """Yield a note if a body loses the fraction NOTED_LOSS of its energy or more in its impact."""
     scene, velocity = facts.scene, np.array(body.arrival.impact)
     speed = float(np.linalg.norm(velocity))
     # A body whose stiffness vanishes has no waves, and one that is held does not fall.

@@ -42,6 +42,7 @@ def unit_findings(facts: SceneFacts) -> Iterator[Finding]:
 
 
 def _gravity(facts: SceneFacts) -> Iterator[Finding]:
+    """Yield warnings if gravity is that of the earth in cm/s^2 or mm/s^2, or points up."""
     domain = facts.scene.domain
     gravity = np.nan_to_num(domain.gravity_at(0.0))
     size, up = float(np.linalg.norm(gravity)), AXES[facts.scene.dimension - 1]
@@ -130,6 +131,7 @@ def _angles_of(shape: Shape) -> Iterator[float]:
 
 
 def _friction(facts: SceneFacts) -> Iterator[Finding]:
+    """Yield coefficients of friction above ROUGH, which may be angles, each value once."""
     scene, words = facts.scene, facts.scene.domain.walls.faces(facts.scene.dimension)
     found = {f"collider {collider.name}": collider.friction for collider in scene.colliders}
     for a, axis in enumerate(AXES[: scene.dimension]):
@@ -147,6 +149,7 @@ def _friction(facts: SceneFacts) -> Iterator[Finding]:
 
 
 def _angle(facts: SceneFacts) -> Iterator[Finding]:
+    """Yield bodies with a friction angle below SMOOTH degrees, which may be radians."""
     for body in facts.bodies:
         angle = getattr(body.body.material, "friction_angle", None)
         if angle is not None and 0 < angle < SMOOTH:
@@ -161,6 +164,7 @@ def _angle(facts: SceneFacts) -> Iterator[Finding]:
 
 
 def _room(facts: SceneFacts) -> Iterator[Finding]:
+    """Yield a note if all bodies and colliders begin in a small part of a large dense grid."""
     scene = facts.scene
     if scene.emitters or not scene.bodies or math.prod(scene.domain.cells) < MANY or scene.solver.grid == "sparse":
         return

@@ -119,6 +119,7 @@ def study_path(path: Path, output: Path | None, asked: dict[str, Any]) -> int:
 
 
 def _study_of(path: Path, output: Path | None, asked: dict[str, Any]) -> tuple["Study", Path | None]:
+    """Run the siblings of a scene or of a finished result; return the study, and where it is written."""
     from mpmcli.check.finding import passes
     from mpmcli.check.scene_check import check_scene
     from mpmcli.error_bars.report import write

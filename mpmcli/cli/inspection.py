@@ -100,6 +100,7 @@ def info_command(
 
 
 def _scene_facts(path: Path, overrides: tuple[str, ...], plugins: tuple[Path, ...]) -> dict:
+    """Return the facts of a scene, with the memory that its plan takes, bytes."""
     from mpmcli.materials.registry import load_plugins
     from mpmcli.scene import load_scene
     from mpmcli.solver.engine.plan import make_plan
@@ -132,6 +133,7 @@ def _scene_facts(path: Path, overrides: tuple[str, ...], plugins: tuple[Path, ..
 
 
 def _result_facts(path: Path) -> dict:
+    """Return the facts of a result from its header, record, ledger and error bars."""
     from mpmcli.error_bars.bars import read_bars
     from mpmcli.output import open_result
 

@@ -113,6 +113,7 @@ def _summary(law: type) -> str:
 
 
 def _print(facts: dict[str, list[dict[str, Any]]], in_full: bool) -> None:
+    """Print tables of presets and laws; `in_full` those of each preset with values, sources and knobs."""
     if facts["presets"] and not in_full:
         _show('Presets: material = "honey", or { preset = "honey", thickness = 0.7, density = 1400 }')
         _say_table(["preset", "law", "what it shows"], [[p["name"], p["law"], p["shows"]] for p in facts["presets"]])

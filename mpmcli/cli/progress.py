@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from mpmcli.frames.ledger import LedgerRow
     from mpmcli.simulation.summary import RunSummary
     from mpmcli.validation.case import Case
-    from mpmcli.validation.runs import Run, RunResult
+    from mpmcli.validation.runs import CaseRun, RunResult
 
 
 class ProgressBar:
@@ -23,6 +23,7 @@ class ProgressBar:
     """
 
     def __init__(self, total: int, unit: str, *, quiet: bool, pause: float = 5.0, steady: bool = True) -> None:
+        """Make the bar; `__enter__` shows it on a terminal."""
         self._total = total
         self._unit = unit
         self._quiet = quiet
@@ -134,7 +135,7 @@ class ValidateProgress(ProgressBar):
             self.say(f"{self._kept} of {self._total} runs are done already, by the same program")
         return super().__enter__()
 
-    def advance(self, run: "Run", result: "RunResult", done: int) -> None:
+    def advance(self, run: "CaseRun", result: "RunResult", done: int) -> None:
         """Show another finished run."""
         what = f"{run.case}, n = {run.n}, {run.setting.label}"
         if result.finished:

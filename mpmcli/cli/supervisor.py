@@ -137,6 +137,7 @@ def _attend(child: int, requests: set[signal.Signals], watched: set[signal.Signa
 
 
 def _code(status: int) -> int:
+    """Return the exit code of a child of this wait status; if it was killed, so is this process."""
     if not os.WIFSIGNALED(status):
         return os.waitstatus_to_exitcode(status)
     number = os.WTERMSIG(status)

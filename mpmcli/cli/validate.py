@@ -170,6 +170,7 @@ def _study(
 
 
 def _chosen(names: Sequence[str]) -> list["Case"]:
+    """Return the cases of these names and families, or all. Raises InputError for an unknown one."""
     from mpmcli.scene.problem import hint_at, listed
     from mpmcli.validation.cases import all_cases
 
@@ -186,6 +187,7 @@ def _chosen(names: Sequence[str]) -> list["Case"]:
 
 
 def _list(cases: Sequence["Case"], level: "Level", as_json: bool) -> None:
+    """Print the cases with their resolutions and numbers of runs at a level."""
     from mpmcli.plain_text import text_table
     from mpmcli.validation.runs import runs_of
 

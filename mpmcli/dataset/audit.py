@@ -304,6 +304,7 @@ class Seen:
     """What is kept of a trajectory: moments, (4, d), hashes of frames but the first, and a fingerprint of lengths."""
 
     def __init__(self, one: Exported) -> None:
+        """Compute moments, hashes and fingerprint of an exported trajectory."""
         self.name, self.split, self.size = one.name, one.split, one.v.size
         self.moments = [f(a, axis=(0, 1)) for a in (one.v, np.diff(one.v, axis=0)) for f in (np.nanmean, np.nanvar)]
         self.hashes = {hash(frame.tobytes()) for frame in one.arrays["position"][1:]}

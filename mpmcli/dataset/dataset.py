@@ -151,6 +151,7 @@ class _StoredTrajectory(Trajectory):
 
 class _ResultTrajectory(Trajectory):
     def __init__(self, result: Result) -> None:
+        """Take a result as trajectory 0. Raises InputError if its particles change in number, or frames are missing."""
         counts = result.particle_counts
         if counts.min() != counts.max() and not result.header.drops:
             raise InputError(
@@ -204,6 +205,7 @@ class _PresentTrajectory(_ResultTrajectory):
     """
 
     def __init__(self, result: Result) -> None:
+        """Read all frames once, for the first and the last frame of each id, its places there and its labels."""
         super().__init__(result)
         n = self.particle_count = 1 + max(int(frame.id.max(initial=-1)) for frame in result.frames([]))
         self._first, self._last = np.full(n, self.frame_count), np.full(n, -1)
@@ -217,6 +219,7 @@ class _PresentTrajectory(_ResultTrajectory):
                 labels[frame.id] = getattr(frame, name)
 
     def _array(self, name: str, k: int) -> np.ndarray:
+        """Return an array of frame k with a row for each id; `status` tells which particles are absent."""
         if name in LABELS:
             return self._labels[name]
         frame = self._result.frame(k, [name] if name in self.field_names else [])
@@ -324,6 +327,7 @@ class Windows:
     def __init__(
         self, dataset: Dataset, split: str, past: int, future: int, stride: int, fields: tuple[str, ...]
     ) -> None:
+        """Count the windows of the split. Raises InputError for an unknown split, or lengths that make no window."""
         if split not in SPLITS:
             raise InputError(f'there is no split "{split}": the splits are {listed(quoted(SPLITS), "and")}.')
         if min(past, stride) < 1 or future < 0:

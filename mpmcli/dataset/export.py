@@ -18,7 +18,7 @@ from mpmcli.dataset.formats import FORMATS, format_named
 from mpmcli.dataset.metadata import EXPORTED_BY, common_facts
 from mpmcli.dataset.report import status_of
 from mpmcli.dataset.shard import SPLITS, group_name
-from mpmcli.dataset.subsample import SEED, SubsampledTrajectory, Walls
+from mpmcli.dataset.subsample import SEED, SubsampledTrajectory, WallChoice
 from mpmcli.errors import InputError, RunError
 from mpmcli.output import check_directory
 from mpmcli.output.checksums import SUMS, path_digest, sums_faults, sums_text
@@ -55,7 +55,7 @@ class ExportSettings:
     stride: int = 1
     max_particles: int | None = None
     overwrite: bool = False
-    walls: Walls = "none"
+    walls: WallChoice = "none"
     wall_spacing: float | None = None
     features: tuple[str, ...] | None = None
     present: Literal["any", "always"] = "any"

@@ -53,6 +53,7 @@ class TrajectoryCells(Result):
     kind = "packed"
 
     def __init__(self, dataset: Dataset, numbers: Sequence[int], frame: str | None) -> None:
+        """Choose the frame of each trajectory, and join their headers. Raises InputError if dimensions differ."""
         self._trajectories = [dataset[number] for number in numbers]
         self._chosen = [_position(frame, each) for each in self._trajectories]
         headers = [each.header for each in self._trajectories]
@@ -106,6 +107,7 @@ class TrajectoryCells(Result):
         return tuple(collider for each in self._trajectories for collider in each.colliders)
 
     def _read(self, k: int, names: Sequence[str]) -> dict[str, np.ndarray]:
+        """Return arrays of the frame of trajectory k, in which bodies are numbered through all trajectories."""
         trajectory, frame = self._trajectories[k], self._chosen[k]
         stored = {}
         for name in names:

@@ -180,6 +180,7 @@ def _by_file(rows: Sequence[Row]) -> dict[str, list[Row]]:
 
 
 def _faults_of(file: Path, rows: list[Row]) -> list[str]:
+    """Return what is wrong with a shard: trajectories missing, out of place or damaged, or bytes changed."""
     faults = []
     try:
         with open_shard(file) as opened:
@@ -230,7 +231,7 @@ MOST_COUNTED = 6
 # Probability of such ranks by chance below which trajectories left out are said to cluster.
 CLUSTERED = 0.05
 LEVELS = "▁▂▃▄▅▆▇█"
-EMPTY = "·"
+NO_BAR = "·"
 
 
 def write_card(directory: Path) -> Path:
@@ -555,7 +556,7 @@ def histogram(values: Sequence[float], low: float, high: float) -> str:
     for value in values:
         counts[min(BINS - 1, int(BINS * ((value - low) / (high - low))))] += 1
     most = max(counts)
-    return "".join(LEVELS[-(-count * len(LEVELS) // most) - 1] if count else EMPTY for count in counts)
+    return "".join(LEVELS[-(-count * len(LEVELS) // most) - 1] if count else NO_BAR for count in counts)
 
 
 def number_text(value: float) -> str:

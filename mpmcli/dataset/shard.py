@@ -181,6 +181,7 @@ def open_shard(path: Path) -> Iterator[h5py.File]:
 
 
 def _fault(data: TrajectoryData) -> str:
+    """Return why data cannot be stored as a trajectory, "" if it can."""
     if data.split not in SPLITS:
         return f'its split is "{data.split}", and not one of {", ".join(SPLITS)}'
     if data.position.ndim != 3 or data.velocity.shape != data.position.shape:

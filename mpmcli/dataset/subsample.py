@@ -18,7 +18,7 @@ from mpmcli.scene.rigid import Path
 from mpmcli.scene.surface import collider_surface, form_surface, surface_points
 
 # Walls with particles: none, colliders, or colliders and the domain.
-Walls = Literal["none", "colliders", "all"]
+WallChoice = Literal["none", "colliders", "all"]
 # Kinds of wall of a particle: at rest, with prescribed motion, or moving freely.
 KINDS = ("wall", "moving_wall", "rigid_body")
 # Number of the walls of the domain, in place of that of a collider.
@@ -36,7 +36,7 @@ class WallParticles:
 
     header: RunHeader
     colliders: tuple[Collider, ...]
-    walls: Walls
+    walls: WallChoice
     spacing: float
 
     @cached_property
@@ -114,7 +114,7 @@ class SubsampledTrajectory:
         source: Trajectory,
         stride: int = 1,
         most: int | None = None,
-        walls: Walls = "none",
+        walls: WallChoice = "none",
         wall_spacing: float | None = None,
         *,
         always: bool = False,

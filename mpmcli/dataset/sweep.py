@@ -178,6 +178,7 @@ def read_distribution(value: object) -> Distribution:
 
 
 def _kind(table: dict[str, Any]) -> str:
+    """Return the distribution that a table of `vary` names, and refuse tables that name none, several or other keys."""
     if any(isinstance(inner, dict) for inner in table.values()):
         raise flaw('must be a distribution or a value; a key with dots stands in quotes, "domain.gravity"')
     found = [kind for kind in _KINDS if kind in table]
@@ -448,6 +449,7 @@ class TrajectoryValues:
     """Values of one trajectory; those `given`, by the keys of `sweep.distributions`, are not drawn."""
 
     def __init__(self, sweep: Sweep, number: int, given: Mapping[str, Any]) -> None:
+        """Choose the values of grids by the number, and the point of distributions that are drawn together."""
         self.sweep, self.number = sweep, number
         # The last grid changes from each trajectory to the next.
         grids, left = {}, number

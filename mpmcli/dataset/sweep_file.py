@@ -86,6 +86,7 @@ def _as_written(problem: Problem, data: dict[str, Any]) -> Problem:
 
 
 def _misplaced(sweep: Sweep) -> Iterator[Problem]:
+    """Yield problems of placements: unknown or repeated templates, names that are taken, regions outside the domain."""
     domain = sweep.base_data["domain"]
     for index, place in enumerate(sweep.placements):
         path = ("place", index)

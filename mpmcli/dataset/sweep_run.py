@@ -353,6 +353,7 @@ class _Run:
     def compute_missing(
         self, joined: Workers | None, began: float, on_progress: Callable[[SweepState], None], stop: Callable[[], bool]
     ) -> None:
+        """Compute trajectories without a row, then certificates; `began` is when the sweep began, s."""
         state, missing = self.state, [n for n in self.folder.all_numbers() if n not in self.rows]
         chosen = {*certify_plan(self.sweep)["numbers"]} - certificates(self.folder.path)[0].keys()
         chosen &= {n for n in self.folder.all_numbers() if n not in self.rows or self.rows[n].accepted}

@@ -109,6 +109,7 @@ def _cuda(driver: ctypes.CDLL) -> list[Device]:
 
 
 def _vulkan(loader: ctypes.CDLL) -> list[Device]:
+    """Return the devices that a Vulkan loader finds: name, and whether it is a processor."""
     instance, count = ctypes.c_void_p(), ctypes.c_uint32()
     # VkInstanceCreateInfo: sType is 1, and all other members may be zero.
     info = (ctypes.c_uint64 * INSTANCE_INFO_WORDS)(1)

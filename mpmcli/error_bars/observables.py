@@ -86,6 +86,7 @@ class Observer:
     observed: Mapping[str, Expression] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        """Prepare for frames: masses, kg, sizes of rigid bodies, m, and axes along which places have an origin."""
         self._mass = np.concatenate([np.empty(0), *(np.full(body.count, body.mass) for body in self.particles)])
         self.particles = ()
         d = self.scene.dimension
@@ -137,6 +138,7 @@ class Observer:
         return Series(np.array(self._times), values, np.array(self._maps), reach, self._heaviest)
 
     def _observe(self, x: np.ndarray, frame: Frame, mass: np.ndarray, row: LedgerRow) -> dict[str, float]:
+        """Return the observables of a frame by name: places, velocities, energies, loads, poses and expressions."""
         d, found = self.scene.dimension, {}
         v = frame.velocity.astype(float)
         for k, source in enumerate(self.scene.sources):

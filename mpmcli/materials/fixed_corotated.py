@@ -68,6 +68,7 @@ class FixedCorotated(Law):
     def respond(
         self, deformation: ti.template(), internal: ti.template(), C: ti.template(), dt: float, constants: ti.template()
     ):
+        """Return tau, tau_zz = lambda (J - 1) J, Pa, and F and the internal variables unchanged; see `Law.respond`."""
         F = deformation
         J = F.determinant()
         pressure_part = constants[LAMBDA] * (J - 1.0) * J

@@ -27,7 +27,7 @@ DEAD_BAND = 0.02
 # Largest lack of volume that causes pressure, so that coincident particles do not explode.
 LARGEST_LACK = 0.1
 # Difference that is ignored without pressure.
-SLACK = 0.005
+FREE_DEAD_BAND = 0.005
 # Suction that a fluid bears before it tears: that of this opening, and at most one atmosphere, where liquids boil. It
 # draws a stream together while gravity stretches it. With a fifth of it a column that is drawn out at once tears;
 # four times as much changes nothing.
@@ -173,7 +173,7 @@ def relaxed_volume(J: float, seen: float, crossings: float, rate: float, opens: 
     """
     free = J
     if J >= 1.0:
-        free = ti.max(J + opens * ti.max(seen - J - DEAD_BAND, 0.0) + ti.min(seen - J + SLACK, 0.0), 1.0)
+        free = ti.max(J + opens * ti.max(seen - J - DEAD_BAND, 0.0) + ti.min(seen - J + FREE_DEAD_BAND, 0.0), 1.0)
     gap = ti.max(seen, ti.min(free, 1.0) - LARGEST_LACK) - free
     # At the density at rest there is no space to open: evenly spaced particles may bear pressure.
     room = ti.max(ti.min(gap, seen - 1.0) - DEAD_BAND, 0.0)
@@ -227,6 +227,7 @@ class Fluid(Law):
     eases = (1.5, 1.8)
 
     def __init__(self, members: tuple[FluidParameters, ...], dimension: int) -> None:
+        """Set the flags of the kernels by what any of the fluids has, or all of them have."""
         super().__init__(members, dimension)
         self.linear = all(member.exponent == 1 for member in members)
         self.viscous = any(member.viscosity > 0 or member.bulk_viscosity > 0 for member in members)
@@ -297,6 +298,7 @@ class Fluid(Law):
     def respond(
         self, deformation: ti.template(), internal: ti.template(), C: ti.template(), dt: float, constants: ti.template()
     ):
+        """Return tau and tau_zz, Pa, J, at most LARGEST_J if the law `projects`, and the internal variables."""
         J = deformation
         if ti.static(self.projects):
             J = ti.min(J, constants[LARGEST_J])

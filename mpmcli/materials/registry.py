@@ -42,6 +42,7 @@ def load_plugins(paths: Sequence[Path]) -> tuple[type[MaterialParameters], ...]:
 
 
 def _load_plugin(path: Path) -> None:
+    """Register the LAW of a file. Raises InputError if there is none, or it is incomplete or named as another."""
     module = _run(path)
     law = getattr(module, "LAW", None)
     if law is None:

@@ -213,6 +213,7 @@ class Sand(HenckyLaw):
     def respond(
         self, deformation: ti.template(), internal: ti.template(), C: ti.template(), dt: float, constants: ti.template()
     ):
+        """Return tau and tau_zz, Pa, F after the return to the cone, and both volume strains, see `SandParameters`."""
         F = deformation
         v = internal
         Q, s = principal_stretches(deformation)

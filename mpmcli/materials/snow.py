@@ -162,6 +162,7 @@ class Snow(Law):
     def respond(
         self, deformation: ti.template(), internal: ti.template(), C: ti.template(), dt: float, constants: ti.template()
     ):
+        """Return tau and tau_zz, Pa, F with clamped stretches, and J_P, which takes what was cut off."""
         F = deformation
         variables = internal
         Q, s = principal_stretches(F)

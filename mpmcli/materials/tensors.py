@@ -147,6 +147,7 @@ def from_principal(Q: ti.template(), values: ti.template()):
 
 @ti.func
 def _stretches_2d(F: ti.template()):
+    """Return (Q, s) of `principal_stretches` in 2D, by one rotation of F F^T."""
     Q = ti.Matrix.identity(float, 2)
     b00 = F[0, 0] * F[0, 0] + F[0, 1] * F[0, 1]
     b11 = F[1, 0] * F[1, 0] + F[1, 1] * F[1, 1]
@@ -184,6 +185,7 @@ def _polishing_steps() -> int:
 
 @ti.func
 def _stretches_3d(F: ti.template()):
+    """Return (Q, s) of `principal_stretches` in 3D: first the eigenvalue farthest from the others, then a rotation."""
     f0 = ti.Vector([F[0, 0], F[0, 1], F[0, 2]])
     f1 = ti.Vector([F[1, 0], F[1, 1], F[1, 2]])
     f2 = ti.Vector([F[2, 0], F[2, 1], F[2, 2]])

@@ -131,6 +131,7 @@ class Viscoplastic(Law):
     def respond(
         self, deformation: ti.template(), internal: ti.template(), C: ti.template(), dt: float, constants: ti.template()
     ):
+        """Return tau and tau_zz, Pa, F with its deviator relaxed, torn or reset, and the internal variables."""
         F = deformation
         J = F.determinant()
         size = length_ratio(ti.max(J, CRUSHED), F.n)

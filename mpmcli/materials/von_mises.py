@@ -105,6 +105,7 @@ class VonMises(HenckyLaw):
     def respond(
         self, deformation: ti.template(), internal: ti.template(), C: ti.template(), dt: float, constants: ti.template()
     ):
+        """Return tau and tau_zz, Pa, F after the radial return, the plastic strain and, in 2D, the elastic one in z."""
         F = deformation
         variables = internal
         mu = constants[MU]

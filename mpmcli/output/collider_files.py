@@ -174,6 +174,7 @@ def _written(directory: Path, name: str, size: int) -> Iterator[Path]:
 
 
 def _write_vtkhdf(path: Path, group: ColliderGroup, times: Sequence[float]) -> None:
+    """Write the surfaces of a group, at all times if it moves, with meshes as they were given, and a checksum."""
     whole, labels = group.whole, group.labels
     count, cells, corners = len(whole.points), len(whole.cells), whole.cells.shape[1]
     with h5py.File(path, "w", libver=LIBVER, locking="best-effort") as file:

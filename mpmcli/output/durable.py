@@ -20,7 +20,7 @@ TEMPORARY_SUFFIX = ".tmp"
 # Bytes left free in addition to the data to be written: file system metadata and other programs.
 SPACE_MARGIN = 16 * 1024 * 1024
 # Error codes of the system for a lack of space.
-FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 def temporary_of(path: Path) -> Path:
@@ -151,7 +151,7 @@ def remove_numbered(folder: Path, names: re.Pattern[str], spared: Collection[Pat
 
 def is_full(error: BaseException) -> bool:
     """Return whether an error reports a full disk, an exceeded quota, or the limit on the size of a file."""
-    return isinstance(error, OSError) and error.errno in FULL
+    return isinstance(error, OSError) and error.errno in NO_SPACE
 
 
 def largest_file() -> int | None:

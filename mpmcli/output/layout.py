@@ -153,6 +153,7 @@ class FrameLayout:
 
 
 def _named_arrays(frame: Frame) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield the arrays of a frame by name, in the order of the file. Raises ValueError for an invalid name."""
     n = len(frame.position)
     yield POSITION, frame.position
     # Row i is particle i, so most Frames store no ids; in the file, ids let ParaView follow a particle.

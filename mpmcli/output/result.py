@@ -53,6 +53,7 @@ class Result(ABC):
     collider_frames: tuple[int, ...] | None = None
 
     def __init__(self, path: Path, index: FrameIndex) -> None:
+        """Take tables of all frames, and read header and record. Raises DamageError if the header cannot be read."""
         self.path = path
         self.index = index
         self.times = index.times

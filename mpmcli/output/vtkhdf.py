@@ -95,6 +95,7 @@ class VtkhdfWriter:
     """
 
     def __init__(self, path: Path, layout: FrameLayout, counts: Sequence[int], *, compress: bool = False) -> None:
+        """Create the file and its datasets, and write all that follows from the counts."""
         self._layout = layout
         self._counts = np.asarray(counts, dtype=np.int64)
         self._compress = compress
@@ -207,6 +208,7 @@ class VtkhdfWriter:
         self._items[f"{path}@{name}"] = attribute_checksum(value)
 
     def _storage(self, shape: tuple[int, ...], row_bytes: int) -> dict:
+        """Return the arguments of h5py for a dataset of rows of this size: none, or chunks and compression."""
         if not self._compress or shape[0] == 0:
             return {}
         # With equal counts, a chunk contains whole frames, or a frame is a whole number of chunks.

@@ -268,6 +268,7 @@ class Panel:
 
 
 def _energy(parts: Panel, change: Panel, history: History) -> None:
+    """Plot the energies over time, and the change of their total over its largest value."""
     columns, header = history.columns, history.header
     potential = columns["potential"]
     above = potential - np.nanmin(potential) if np.isfinite(potential).any() else potential
@@ -314,6 +315,7 @@ def _momenta(linear: Panel, angular: Panel, history: History) -> None:
 
 
 def _steps(length: Panel, courant: Panel, history: History) -> None:
+    """Plot the range of steps between frames, s, by what limits them, and the Courant number."""
     length.title("Time step, by limit", "smallest to largest, s")
     shortest, longest = history.columns["step_min"], history.columns["step_max"]
     names = [name for name in LIMITS if name in history.limits]

@@ -196,6 +196,7 @@ def render_frames(
 def _render_beside(
     job: Job, ks: Sequence[int], count: int, watch: Callable[[int, Any], None], stop: Callable[[], bool]
 ) -> None:
+    """Render frames in `count` processes, and hand each to `watch`. Raises RunError if a process dies."""
     others = set(multiprocessing.active_children())
     pool = ProcessPoolExecutor(count, SPAWN, _begin, (job,))
     try:

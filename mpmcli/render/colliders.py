@@ -187,6 +187,7 @@ class ColliderActors:
     """Shaded surfaces in a window, visible from the side of the material, so that a container hides no content."""
 
     def __init__(self, scene: RenderScene, theme: Theme, window: OffscreenRenderer) -> None:
+        """Add the surfaces of all colliders, and their edges, to a window."""
         self._scene = scene
         self._actors: list[tuple[ColliderMesh, list[pv.Actor]]] = []
         self._shown = self._actors
@@ -248,6 +249,7 @@ def with_collider_images(position: np.ndarray, distance: float, scene: RenderSce
 
 
 def _images(position: np.ndarray, distance: float, collider: Collider, time: float) -> np.ndarray:
+    """Return the images, m, of particles near a collider that mirror them into it where it is thick enough."""
     away = collider.signed_distance(position, time)
     near = (away > 0) & (away < NEAR * distance)
     points, away = position[near], away[near, None]

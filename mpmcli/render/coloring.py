@@ -123,6 +123,7 @@ def material_colors(scene: RenderScene, inks: Sequence[str]) -> Categories:
 
 
 def _value(name: str, result: Result, scene: RenderScene) -> Coloring:
+    """Return the colouring by speed, id, density, J or von Mises stress, or else by a stored field."""
     stored = result.field_names
     densities = np.array(scene.densities)
     if name == "speed":
@@ -144,6 +145,7 @@ def _value(name: str, result: Result, scene: RenderScene) -> Coloring:
 
 
 def _field(name: str, result: Result) -> Coloring:
+    """Return the colouring by a field, its norm or a component. Raises InputError if it is not stored."""
     field, _, component = name.partition(".")
     if field not in (*result.field_names, "velocity"):
         raise _not_stored(name, result, field)

@@ -27,7 +27,7 @@ LEVEL, FINE_LEVEL = 0.04, 1e-4
 FARTHEST = 16  # maximum number of squares on each side that are searched for dots that hide another
 STRENGTH = 0.55  # fraction of the light that a deep gap absorbs
 DEEP = 4.0  # depth of a deep gap, in diameters of a dot
-REACH = 1.2  # distance of the compared pixels, in diameters of a dot
+COMPARED_DISTANCE = 1.2  # distance of the compared pixels, in diameters of a dot
 MOST = 1.5  # upper bound of a gap, in units of `DEEP`: anything farther away is another body
 DIRECTIONS = ((1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1))
 
@@ -36,6 +36,7 @@ class DotsPainter:
     """Draws frames, of which the largest has `count` particles, as dots."""
 
     def __init__(self, scene: RenderScene, view: View, theme: Theme, colors: Coloring | Categories, count: int) -> None:
+        """Prepare the window, and in 3D its light, the box of the domain and colliders."""
         self._scene, self._view, self._colors = scene, view, colors
         self.fields = colors.fields
         self._flat = scene.dimension == 2
@@ -103,6 +104,7 @@ class DotsPainter:
         return result
 
     def _set(self, level: int, points: np.ndarray, colors: np.ndarray, size: float) -> None:
+        """Show points as dots of `size` pixels, in the actor of their level."""
         import pyvista as pv
 
         # VTK stores positions in single precision, too coarse for a domain far from the origin.
@@ -146,7 +148,7 @@ def depth_shaded(
     if not solid.any():
         return picture
     # At a very small distance a dot is larger than the picture.
-    reach = max(1, min(round(REACH * diameter * view.pixels_per_metre), max(view.size)))
+    reach = max(1, min(round(COMPARED_DISTANCE * diameter * view.pixels_per_metre), max(view.size)))
     bare = np.where(solid, nearest, np.float32(view.far))
     padded = np.pad(bare, reach, mode="edge")
     gap = np.zeros_like(bare)

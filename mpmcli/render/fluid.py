@@ -43,6 +43,7 @@ class FluidPainter:
     fields: tuple[str, ...] = ()
 
     def __init__(self, scene: RenderScene, view: View, theme: Theme) -> None:
+        """Prepare what all frames share: lights, background, and a window with box and colliders."""
         self._scene, self._view = scene, view
         extent = np.subtract(scene.upper, scene.lower)
         # Absorption scales with the size of the scene, so that a beaker and a reservoir look alike.

@@ -319,6 +319,7 @@ def _along_rows(depth: np.ndarray, decay: np.ndarray, radius: float, taps: int, 
 
 
 def _narrow_range(part: np.ndarray, decay: np.ndarray, radius: np.float32, taps: int, step: int) -> np.ndarray:
+    """Return the depths of a part, without its margins, smoothed along rows by a Gaussian that ends at jumps."""
     reach, columns = taps * step, decay.shape[1]
     centre = part[:, reach : reach + columns]
     range_ = 4 * radius
@@ -381,6 +382,7 @@ def normals(points: np.ndarray, covered: np.ndarray) -> np.ndarray:
 
 
 def _smaller_step(points: np.ndarray, covered: np.ndarray, axis: int) -> np.ndarray:
+    """Return for each pixel the step to one neighbour along an axis, that of the smaller change of depth."""
     step = np.diff(points, axis=axis)
     pixel = float(np.median(np.abs(step[..., 1 - axis][step[..., 1 - axis] != 0]))) if step.any() else 0.0
     pair = covered[1:] & covered[:-1] if axis == 0 else covered[:, 1:] & covered[:, :-1]

@@ -20,7 +20,7 @@ from mpmcli.render.view import View
 # Fraction of the incident light that a finish blocks; 1 is a full shadow.
 OPACITY: dict[Finish, float] = {"water": 0.22, "syrup": 0.55, "translucent": 0.6}
 CELLS_LONG, CELLS = 88, 140_000  # cells along the longest side of the domain, and largest total
-REACH = 0.7  # distance beyond the domain to which shadows may fall, as a fraction of its height
+SHADOW_REACH = 0.7  # distance beyond the domain to which shadows may fall, as a fraction of its height
 DEPTH_OF_CELL = 1.1  # optical depth of a cell filled with opaque material
 STEEPEST = 3.5  # largest lateral shift of light from layer to layer, cells
 # Directions of the sky's light: lateral shift from layer to layer, cells, and weight.
@@ -77,7 +77,7 @@ def occlusion_by(
     low, high = np.sort(signs * np.array([scene.lower, scene.upper])[:, axes], axis=0)
     size = high - low
     edge = max(float(size.max()) / CELLS_LONG, float((size.prod() / CELLS) ** (1 / 3)))
-    pad = np.array([0, 1, 1]) * (math.ceil(REACH * size[0] / edge) + 2)
+    pad = np.array([0, 1, 1]) * (math.ceil(SHADOW_REACH * size[0] / edge) + 2)
     shape = tuple((np.ceil(size / edge - 1e-9).astype(int) + 2 * pad).tolist())
     corner = low - edge * pad
     cells = np.clip(((places[:, axes] * signs - corner) / edge).astype(int), 0, np.array(shape) - 1)
@@ -119,6 +119,7 @@ class Background:
     """A gradient, brighter below than above, and a floor, computed once, with the shadows of each frame."""
 
     def __init__(self, scene: RenderScene, view: View, theme: Theme) -> None:
+        """Compute the gradient, and where lines of sight meet the floor, with its share of each pixel."""
         width, height = view.size
         down = np.linspace(0.0, 1.0, height)[:, None]
         ease = down * down * (3.0 - 2.0 * down)

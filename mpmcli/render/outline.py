@@ -43,6 +43,7 @@ class OutlinePainter:
     """Draws the materials of a 2D run as filled bodies."""
 
     def __init__(self, scene: RenderScene, view: View, theme: Theme, colors: Coloring | None = None) -> None:
+        """Prepare a grid whose nodes are the pixels, and the part of it inside the domain."""
         self.scene, self.view, self.theme, self.colors = scene, view, theme, colors
         self.fields = () if colors is None else colors.fields
         width, height = view.size

@@ -10,7 +10,7 @@ from scipy.ndimage import convolve1d, gaussian_filter, map_coordinates
 STRAY = 4.0  # distance outside the domain up to which a particle is drawn, in radii
 SPREAD = 1.25  # standard deviation of the Gaussian of a particle's area, in distances between particles
 FINENESS = 3.0  # smallest number of grid nodes per distance between particles
-REACH = 3.2  # reach of the Gaussian, in standard deviations
+CUTOFF = 3.2  # distance at which the Gaussian is cut off, in standard deviations
 DISK = math.sqrt(1.0 / math.pi)  # radius of the disk that has the area of a particle, in distances
 # Cover at its position, below which a particle is isolated and drawn as a disk, and above which it is not.
 ALONE, TOGETHER = 0.34, 0.42
@@ -86,7 +86,7 @@ def cover_of(
     It is 1 within a body, 1/2 on its straight edge, and does not fade at the walls of the domain, which are mirrors. An
     isolated particle is a disk of its own area, with 1/2 on its rim.
     """
-    images = with_images(position, REACH * SPREAD * distance, lower, upper)[0]
+    images = with_images(position, CUTOFF * SPREAD * distance, lower, upper)[0]
     deviation = SPREAD * distance
     cover = spread(images, np.full(len(images), distance**2), deviation, grid)
     nearest = np.rint((position - np.array(grid.corner)) / grid.edge).astype(int)
@@ -106,7 +106,7 @@ def cover_of(
 
 def spread(position: np.ndarray, weights: np.ndarray, deviation: float, grid: Grid) -> np.ndarray:
     """Return the sum (rows, columns) of Gaussians of integral `weights` (n,) about particles (n, 2), by area."""
-    margin = math.ceil(REACH * deviation / grid.edge) + 1
+    margin = math.ceil(CUTOFF * deviation / grid.edge) + 1
     shape = (grid.shape[0] + 2 * margin, grid.shape[1] + 2 * margin)
     place = (position - np.array(grid.corner)) / grid.edge + margin
     total = deposited(place, weights, shape)
@@ -117,7 +117,7 @@ def spread(position: np.ndarray, weights: np.ndarray, deviation: float, grid: Gr
 
 def soft(values: np.ndarray, deviation: float) -> np.ndarray:
     """Return values (rows, columns) blurred by a Gaussian of a deviation in cells, if it is wide enough to matter."""
-    return values if deviation < 0.15 else gaussian_filter(values, deviation, mode="constant", truncate=REACH)
+    return values if deviation < 0.15 else gaussian_filter(values, deviation, mode="constant", truncate=CUTOFF)
 
 
 def disk_nodes(position: np.ndarray, reach: float, grid: Grid) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:

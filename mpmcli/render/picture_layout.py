@@ -155,6 +155,7 @@ class PictureLayout:
 
     @property
     def _column(self) -> int:
+        """Return the width of the column of the colour bar or the legend, pixels; 0 without colours."""
         length = self._small.getlength
         if self.colors is None:
             return 0
@@ -280,6 +281,7 @@ class PictureLayout:
             self._write(draw, left, y, text, self.theme.faint, "lm" if upright else "lt")
 
     def _legend(self, draw: "ImageDraw", colors: Categories) -> None:
+        """Draw a swatch and a name for each category for which there is room, and the number of the others."""
         pad, swatch, step = self._px(PAD), self._px(SWATCH), self._px(SWATCH + 10)
         x, y = self._scene_box[2] + pad, self._scene_box[1] + pad
         beside = x + swatch + self._px(8)
@@ -303,6 +305,7 @@ class PictureLayout:
         return top, bottom, places, texts, [colors.name, unit]
 
     def _color_bar(self, draw: "ImageDraw", colors: Coloring, missing: int) -> None:
+        """Draw heading, bar and ticks, and a swatch for particles without a number if any are `missing`."""
         line, width = self._px(SMALL + 6), self._px(BAR_WIDTH)
         x, y = self._scene_box[2] + self._px(PAD), self._scene_box[1] + self._px(4)
         top, bottom, places, texts, heading = self._bar(colors)

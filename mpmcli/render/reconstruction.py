@@ -303,6 +303,7 @@ def _joined(meshes: Sequence[Mesh]) -> Mesh:
 
 
 def _write_vtp(path: Path, mesh: Mesh, time: float) -> None:
+    """Write a mesh with its normals and its time, s, as VTK's XML."""
     import pyvista as pv
     import vtk
 
@@ -321,6 +322,7 @@ def _write_vtp(path: Path, mesh: Mesh, time: float) -> None:
 
 
 def _write_obj(path: Path, mesh: Mesh, time: float) -> None:
+    """Write a mesh with its normals as OBJ, with y up, and its time, s, in a comment."""
     # Programs read OBJ with y up, and the up of a scene in 3D is z; a flat mesh lies in the plane x, y already.
     flat = not mesh.points[:, 2].any()
     points, normals = (v if flat else v[:, [0, 2, 1]] * [1, 1, -1] for v in (mesh.points, mesh.normals))

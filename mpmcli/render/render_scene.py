@@ -166,6 +166,7 @@ def render_scene_of(result: Result) -> RenderScene:
 def _materials(
     bodies: Sequence[str], tables: Sequence[Mapping[str, Any]]
 ) -> tuple[tuple[Appearance, ...], tuple[int, ...]]:
+    """Return the appearances of the distinct materials, and the index of that of each body."""
     kinds: list[Mapping[str, Any]] = []
     firsts: list[str] = []
     appearances: list[Appearance] = []

@@ -222,6 +222,7 @@ def plan_render(result: Result, request: Request, captions: tuple[str, ...] = ()
 
 
 def _require_sense(request: Request) -> None:
+    """Refuse options that exclude each other, or have no effect in the mode."""
     if request.movie and request.montage:
         raise InputError("--movie and --montage exclude each other: give one of them.")
     if request.fps is not None and not request.movie:

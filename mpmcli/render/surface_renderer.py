@@ -34,6 +34,7 @@ class SurfaceRenderer:
     """Draws the materials of a 3D run as bodies against a lit background."""
 
     def __init__(self, scene: RenderScene, view: View, theme: Theme, colors: Coloring | None = None) -> None:
+        """Prepare the window, its background and the surfaces of colliders."""
         self.scene, self.view, self.theme, self.colors = scene, view, theme, colors
         self.fields = () if colors is None else colors.fields
         self.background = Background(scene, view, theme)
@@ -152,6 +153,7 @@ class SurfaceRenderer:
         _carry(self.actors[key], occlusion, points, shown.regular_faces, normals, (lighting.linear(color), 0.0, 0.0))
 
     def _new_actor(self, appearance: Appearance, *, by_field: bool, walled: bool = True) -> Any:
+        """Return an actor, added to the renderer, with the shaders of an appearance, or of a field, `by_field`."""
         import vtk
 
         mapper = vtk.vtkPolyDataMapper()

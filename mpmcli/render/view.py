@@ -186,6 +186,7 @@ def _framed(scene: RenderScene, back: np.ndarray, up: np.ndarray, size: tuple[in
 
 
 def _free_view(scene: RenderScene, camera: str, size: tuple[int, int]) -> View:
+    """Return the view in perspective of a camera "x,y,z,x,y,z", place and target, m. Raises InputError for others."""
     try:
         numbers = np.array([float(word) for word in camera.split(",")])
     except ValueError:

@@ -117,6 +117,7 @@ def force_drive(scene: Scene, body: Body, places: np.ndarray, speed: float, grav
 
 
 def _one(scene: Scene, force: Force, places: np.ndarray, speed: float, gravity: Drive) -> Drive:
+    """Return the bound on the acceleration by one force; `speed`, m/s, and gravity tell how far particles come."""
     end = scene.time.end
     if not varies(*force.acceleration):
         size = float(np.linalg.norm(force.acceleration))

@@ -87,7 +87,7 @@ def _in_the_way(emitter: Emitter, places: np.ndarray, scene: Scene) -> Iterator[
         if emitter.start == 0
     ]
     found += [
-        (f'collider "{collider.name}"', collider.signed_distance(places) < -_SLACK * h)
+        (f'collider "{collider.name}"', collider.signed_distance(places) < -_PENETRATION_CELLS * h)
         for collider in scene.colliders
         if not collider.motion.moves and not collider.holds
     ]
@@ -98,6 +98,7 @@ def _in_the_way(emitter: Emitter, places: np.ndarray, scene: Scene) -> Iterator[
 
 
 def _emitted(emitter: Emitter, scene: Scene) -> Iterator[tuple[str, str]]:
+    """Yield (key, sentence) for a negative rate, and for amounts that do not come out until the end."""
     if emitter.rate is not None:
         until = scene.time.end if emitter.end is None else min(scene.time.end, emitter.end)
         times = np.array([emitter.start, *telling_times(tree_of(emitter.rate), emitter.start, until)])
@@ -128,7 +129,7 @@ def _emitted(emitter: Emitter, scene: Scene) -> Iterator[tuple[str, str]]:
 
 
 # Depth in cells at which a particle may lie inside a collider: round-off, and chords of curved surfaces.
-_SLACK = 0.1
+_PENETRATION_CELLS = 0.1
 # Lattices above this size are not examined.
 _MOST_PLACES = 1_000_000
 # Largest number of cells in the bounding box of a collider whose distances are stored on a grid.
@@ -181,7 +182,7 @@ def collider_problems(scene: Scene) -> Iterator[Problem]:
         places = particle_places(body, i, h)
         for k, collider in enumerate(scene.colliders if len(places) else ()):
             distance = collider.signed_distance(places)
-            if distance.min() < -_SLACK * h and not collider.holds:
+            if distance.min() < -_PENETRATION_CELLS * h and not collider.holds:
                 where = place_text(places[distance.argmin()])
                 said = (
                     f'body "{body.name}" overlaps collider "{collider.name}" at the start, for example at {where}; '
@@ -254,6 +255,7 @@ def _repeated_names(scene: Scene) -> Iterator[Problem]:
 
 
 def _outside(scene: Scene) -> Iterator[Problem]:
+    """Yield a problem for each body that leaves the domain, with the faces and by how much, m."""
     domain, words = scene.domain, scene.domain.walls.faces(scene.dimension)
     for i, body in enumerate(scene.bodies):
         form = body.shape.form
@@ -281,6 +283,7 @@ def _outside(scene: Scene) -> Iterator[Problem]:
 
 
 def _overlaps(scene: Scene) -> Iterator[Problem]:
+    """Yield a problem for each pair of bodies with a common point."""
     h = scene.domain.spacing
     bounds = [body.shape.form.bounds() for body in scene.bodies]
     lowers, uppers = np.array([b[0] for b in bounds]), np.array([b[1] for b in bounds])
@@ -365,6 +368,7 @@ def _misfits(body: Body, scene: Scene) -> Iterator[tuple[str, str]]:
 
 
 def _pushed(scene: Scene) -> Iterator[Problem]:
+    """Yield problems of forces and impulses: unknown bodies, and what emitters and rigid bodies cannot have."""
     names = [*(body.name for body in scene.sources), *(one.name for one in scene.colliders if one.free)]
     for table, entries in (("forces", scene.forces), ("impulses", scene.impulses)):
         for k, force in enumerate(entries):
@@ -389,6 +393,7 @@ def _pushed(scene: Scene) -> Iterator[Problem]:
 
 
 def _paired(scene: Scene) -> Iterator[Problem]:
+    """Yield problems of `contact.pairs`: bodies unknown, named twice, paired twice or unable to separate."""
     sources = {body.name: body for body in scene.sources}
     seen: dict[frozenset[str], int] = {}
     for k, pair in enumerate(scene.contact.pairs):

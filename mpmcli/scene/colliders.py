@@ -239,6 +239,7 @@ class Collider(Table):
 
     @model_validator(mode="after")
     def _one_way_to_move(self) -> "Collider":
+        """Refuse a motion given in two ways, and keys that do not apply to the surface or to a free body."""
         for key, other in (("offset", "velocity"), ("angle", "angular_velocity")):
             if getattr(self, key) is not None and self._gives(other):
                 raise flaw(f'"{other}" is given as well; leave one of them out', key)

@@ -118,6 +118,7 @@ class ContactTable:
         return min(found, key=lambda one: -1.0 if one[0] is None else one[0])
 
     def _of_pair(self, first: Body | Emitter, second: Body | Emitter) -> tuple[float | None, str]:
+        """Return the coefficient of friction of two sources, None if they stick, and what determines it."""
         contact = self.scene.contact
         for k, pair in enumerate(contact.pairs):
             if set(pair.between) == {first.name, second.name}:
@@ -168,6 +169,7 @@ class ContactTable:
                     yield sources[first].name, sources[second].name, method, friction, source
 
     def _obstacles(self) -> Iterator[tuple]:
+        """Yield (source, obstacle, method, friction, its origin) for all sources with all colliders and walls."""
         total = self.scene.solver.solids == "total"
         solids = [(one.name, one.wall, one.friction) for one in self.scene.colliders]
         for k, (name, word, friction) in enumerate((*solids, *self._walls())):

@@ -70,6 +70,7 @@ class _Lattice:
     """Cells of edge about `h`, m, in a domain, and the pairs of neighbours along each axis, lower and upper."""
 
     def __init__(self, scene: Scene) -> None:
+        """Divide the domain into cells as large as those of the grid, or larger, so that there are about CELLS."""
         self.scene, d = scene, scene.dimension
         size, spacing = np.array(scene.domain.size), scene.domain.spacing
         self.h = float(spacing * np.ceil(max(1.0, np.prod(size / spacing / CELLS[d] ** (1 / d))) ** (1 / d)))

@@ -119,7 +119,7 @@ def require_grip(velocity: WallVelocity, words: Mapping[str, str], frictions: Ma
 FEWEST_CELLS = 5
 
 
-class Walls(Faces):
+class WallTypes(Faces):
     """The boundary condition at each face of the domain.
 
     slip: no motion through the wall, free motion along it. stick: no motion at all.
@@ -212,8 +212,8 @@ class Domain(Table):
         validate_default=True,
         description="Gravity, m/s^2; numbers, or expressions of the time t (s). Default: none.",
     )
-    walls: Annotated[Walls, BeforeValidator(_one_word_for_all)] = Field(
-        Walls(),
+    walls: Annotated[WallTypes, BeforeValidator(_one_word_for_all)] = Field(
+        WallTypes(),
         description="slip, stick, separate, periodic or open: one word for all faces, or a table.",
         json_schema_extra=_or_table({"enum": list(WALLS)}, "separate"),
     )
@@ -254,6 +254,7 @@ class Domain(Table):
 
     @model_validator(mode="after")
     def _faces_that_belong_together(self) -> "Domain":
+        """Refuse friction where nothing slips, a periodic face without the other, and walls that move without grip."""
         words = self._words()
         for face, word in words.items():
             if word in PASSED | STICKING and getattr(self.friction, face) is not None:

@@ -144,6 +144,7 @@ class _Reader:
         return tree
 
     def _tree(self, node: ast.expr, depth: int) -> Tree:
+        """Return the tree of a node of Python's syntax. Raises ExpressionError for what expressions cannot contain."""
         if depth > MOST_NESTED:
             raise ExpressionError(TOO_DEEP)
         depth += 1
@@ -197,6 +198,7 @@ class _Reader:
         return Number(value)
 
     def _name(self, name: str) -> Tree:
+        """Return the tree of a constant or a variable. Raises ExpressionError, with a hint, for other names."""
         if name in CONSTANTS:
             return Number(CONSTANTS[name])
         if name in self.names:
@@ -210,6 +212,7 @@ class _Reader:
         raise ExpressionError(_unknown("name", name, self.names, (*self.names, *CONSTANTS)))
 
     def _call(self, node: ast.Call, depth: int) -> Tree:
+        """Return the tree of a function with its arguments. Raises ExpressionError if it is unknown or takes others."""
         if not isinstance(node.func, ast.Name):
             raise ExpressionError(f'cannot contain "{self._said(node)}"; a function is called by its name')
         name = node.func.id

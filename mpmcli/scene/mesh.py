@@ -140,6 +140,7 @@ class ClosedSurface:
         return Crossings(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
     def _met(self, lines: np.ndarray, numbers: np.ndarray, first: np.ndarray, count: np.ndarray) -> Crossings:
+        """Return the crossings of lines `numbers` with `count` triangles of the raster each, listed from `first` on."""
         line = np.repeat(numbers, count)
         triangle = self._raster.listed[np.arange(len(line)) + np.repeat(first - np.cumsum(count) + count, count)]
         x, y = lines[line].T
@@ -170,6 +171,7 @@ class _Raster:
     """Which triangles lie over the bins of a raster in the x-y plane."""
 
     def __init__(self, corners: np.ndarray) -> None:
+        """List, bin by bin, the triangles (n, 3, 2) whose bounding boxes overlap the bin."""
         lower, upper = corners.min(axis=1), corners.max(axis=1)
         self.lower = lower.min(axis=0)
         self.count = int(np.clip(np.sqrt(len(corners)), 1, _BINS))

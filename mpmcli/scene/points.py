@@ -152,6 +152,7 @@ def distinct_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _by_trimesh(path: Path) -> Geometry:
+    """Read points and maybe triangles by trimesh. Raises ValueError if a triangle has an unknown corner."""
     import trimesh
 
     try:
@@ -366,6 +367,7 @@ def _npz(path: Path) -> dict[str, np.ndarray]:
 
 
 def _npy(path: Path, d: int) -> dict[str, np.ndarray]:
+    """Return the columns of a NumPy file by name: structured, or (n, d), or (n, 2 d) with velocities."""
     try:
         # Memory-mapped, so that a header cannot claim more than the file holds.
         found = np.load(path, mmap_mode="r", allow_pickle=False)
@@ -384,6 +386,7 @@ def _npy(path: Path, d: int) -> dict[str, np.ndarray]:
 def _data_set(
     path: Path, d: int, velocity: str | Sequence[str] | None, choice: Choice
 ) -> tuple[np.ndarray, np.ndarray | None, ResultState | None, str]:
+    """Return positions, m, velocities, m/s, or None, the state in a file of a result, and a note on its reading."""
     try:
         found = read_geometry(path, choice)
     except GeometryFileError as error:
@@ -426,6 +429,7 @@ def _of_result(found: Geometry, d: int, body: str | None) -> tuple[Geometry, Res
 
 
 def _velocities(found: Geometry, d: int, velocity: str | Sequence[str] | None) -> np.ndarray | None:
+    """Return velocities, (n, d), from the array of a name or one per axis; None without a name."""
     if velocity is None:
         return None
     for name in {*([velocity] if isinstance(velocity, str) else velocity)} - {*found.arrays}:
@@ -492,6 +496,7 @@ class Points(Table, Solid):
 
     @model_validator(mode="after")
     def _read(self, info: ValidationInfo) -> "Points":
+        """Read the file, once per version of it, and require either the spacing of the points or their total volume."""
         path, d = scene_file(self.file, info), scene_dimension(info) or len(self.translate)
         try:
             if None not in (self.frame, self.time):

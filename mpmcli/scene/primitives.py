@@ -238,6 +238,7 @@ def _edge_squares(points: np.ndarray, vertices: np.ndarray) -> np.ndarray:
 
 
 def _located_squares(points: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
+    """Return the squared distance of each point from the nearest segment, m^2, found by a locator of VTK."""
     import pyvista as pv
     from vtkmodules.vtkCommonCore import reference
     from vtkmodules.vtkCommonDataModel import vtkStaticCellLocator
@@ -280,6 +281,7 @@ class Polygon(Table, Solid):
         return vertices.min(axis=0), vertices.max(axis=0)
 
     def contains(self, points: np.ndarray, inset: float = 0.0) -> np.ndarray:
+        """Return which points are inside by at least `inset`, m, (n,) bool."""
         # A point is inside when a ray from it along x crosses the edges an odd number of times.
         order = np.argsort(points[:, 1], kind="stable")
         x, y = points[order].T

@@ -166,6 +166,7 @@ def path_in(data: object, loc: Path, missing: bool = False) -> Path:
 
 
 def _problem(path: Path, errors: list[Any], model: type[BaseModel]) -> Problem:
+    """Return the problem that the errors of Pydantic at one key mean, in the terms of TOML."""
     first = errors[0]
     kind, ctx, value = first["type"], first.get("ctx", {}), first["input"]
     match kind:

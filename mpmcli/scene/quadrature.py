@@ -105,6 +105,7 @@ class _Window:
     """The integral of a tree of t from one time on, by the polynomials of its parts: `rows`, (n, COLUMNS)."""
 
     def __init__(self, tree: Tree, start: float, end: float) -> None:
+        """Compute the polynomials of the integral from `start` to `end`, and a bound on the value in each part."""
         parts = parts_of(tree, start, end)
         half = 0.5 * (parts.high - parts.low)
         coefficients = parts.values @ ANTIDERIVATIVES * half[:, None]

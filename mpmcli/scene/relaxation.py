@@ -18,8 +18,8 @@ _CURVATURES = {2: (1.1, 0.3243), 3: (0.9075, 0.2206)}
 # its square or cube.
 _ENOUGH, _FARTHEST = 1e-3, 0.1
 # Round-off in cells, and the reach of a spline less that.
-_SLACK = 1e-4
-_REACH = 1.5 - _SLACK
+_ROUND_OFF_CELLS = 1e-4
+_SPLINE_REACH = 1.5 - _ROUND_OFF_CELLS
 # Particles per batch, so that intermediate values stay in the cache.
 _AT_ONCE = 2**16
 # The spline w of the node before the nearest one, of that one and of the next, and w r, r the distance from the node:
@@ -88,16 +88,17 @@ class _Nodes:
     """
 
     def __init__(self, bounds: np.ndarray, domain: Domain) -> None:
+        """Place nodes around `bounds`, m, (2, d), and find the walls and periodic faces that act on them."""
         self.h, self.cells, self.origin = domain.spacing, np.array(domain.cells), np.array(domain.origin)
         lower, upper = (bounds - self.origin) / self.h
         self.first = np.floor(lower).astype(int) - 2
         self.counts = tuple((np.ceil(upper).astype(int) + 3 - self.first).tolist())
         self.strides = np.cumprod([1, *self.counts[:0:-1]])[::-1]
         faces = domain.walls.faces(len(self.cells))
-        spans = (lower < _SLACK) & (upper > self.cells - _SLACK)
+        spans = (lower < _ROUND_OFF_CELLS) & (upper > self.cells - _ROUND_OFF_CELLS)
         self.periodic = spans & np.array([PERIODIC in pair for pair in faces])
         self.walls = np.array([[word not in PASSED for word in pair] for pair in faces])
-        ends = np.array([np.full(len(spans), _SLACK), self.cells - _SLACK])
+        ends = np.array([np.full(len(spans), _ROUND_OFF_CELLS), self.cells - _ROUND_OFF_CELLS])
         self.reach = np.where(self.walls.T, ends, [[-np.inf], [np.inf]])
         self.folds = list(self._folds())
 
@@ -130,7 +131,7 @@ class _Nodes:
         some = np.flatnonzero(sums[0] > 0.5)
         places = np.stack(np.unravel_index(some, self.counts), axis=1) + self.first
         full = np.all((places >= 0) & (places <= self.cells - self.periodic), axis=1)
-        for offset in product((-_REACH, 0.0, _REACH), repeat=len(self.counts)):
+        for offset in product((-_SPLINE_REACH, 0.0, _SPLINE_REACH), repeat=len(self.counts)):
             # Nodes behind a wall have an image if the form reaches the wall.
             points = np.clip(places[full] + np.array(offset), *self.reach)
             points = np.where(self.periodic, points % self.cells, points)

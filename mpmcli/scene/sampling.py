@@ -241,6 +241,7 @@ def initial_faults(body: Body, position: np.ndarray, domain: Domain) -> Iterator
 
 
 def _deformation_faults(body: Body, position: np.ndarray, domain: Domain) -> Iterator[tuple[Path, str]]:
+    """Yield (path, sentence) for entries that are not finite, or a first particle whose J is not positive."""
     entries = entries_in(body.deformation, ("deformation",))
     found = [fault for path, entry in entries for fault in _not_finite(path, entry, position)]
     yield from found
@@ -460,6 +461,7 @@ def _turned(body: Body, h: float) -> np.ndarray:
 
 
 def _sample(body: Body, index: int, domain: Domain, position: np.ndarray | None) -> BodyParticles:
+    """Return the particles of a body, at `position`, m, if given. Raises InputError if there are none."""
     form = body.shape.form
     if position is None:
         position = particle_places(body, index, domain.spacing)

@@ -23,7 +23,7 @@ from mpmcli.scene.shapes import Shape
 # Points along each axis of a mouth for its area, in 2D and 3D; the error is 3e-4 and 1e-3.
 _MEASURED = {2: 4096, 3: 768}
 # Sheets late by at most this fraction of a period count as on time.
-_SLACK = 1e-9
+_LATE_SHARE = 1e-9
 # Instants at which a varying rate is integrated; a jump of the rate costs half an interval.
 _INSTANTS = 2**15 + 1
 # Speed, m/s, and area below which nothing flows.
@@ -162,6 +162,7 @@ def _area(shape: Shape, velocity: tuple[float, ...]) -> float:
 
 @lru_cache(maxsize=64)
 def _mouth(shape: Shape, velocity: tuple[float, ...], particles_per_cell: int, h: float) -> Mouth:
+    """Return the mouth of an emitter: its axes, and a lattice that fits its section, with the cells that are inside."""
     d, form = len(velocity), shape.form
     direction, centre, axes, reach, steps, inside = _opening(shape, velocity)
     area, n = _area(shape, velocity), _MEASURED[d]
@@ -279,4 +280,4 @@ def most_until_end(emitter: Emitter, scene: Scene, period: float, size: int, ear
     if varies(emitter.rate) and end > emitter.start:
         mouth = mouth_of(emitter, scene.domain.spacing)
         sheets = _flow(emitter, scene)[1][-1] / (mouth.area * float(mouth.spacing[0])) * mouth.filled.sum() / size
-    return max(0, math.ceil(sheets - _SLACK)) * size
+    return max(0, math.ceil(sheets - _LATE_SHARE)) * size

@@ -110,6 +110,7 @@ def within(surface: Surface, lower: np.ndarray, upper: np.ndarray, *, caps: bool
 
 
 def _triangles_within(surface: Surface, lower: np.ndarray, upper: np.ndarray, caps: bool) -> Surface:
+    """Return the part of a triangulated surface in a box, m, closed on the faces of the box if `caps`."""
     import pyvista as pv
     from vtkmodules.vtkCommonDataModel import vtkPlane, vtkPlaneCollection
     from vtkmodules.vtkFiltersGeneral import vtkClipClosedSurface

@@ -89,6 +89,7 @@ def read_toml(path: str | PathLike[str], kind: str = "scene") -> tuple[str, dict
 
 
 def _parse(text: str, source: str) -> dict[str, Any]:
+    """Return the tables of a text. Raises InputError, with line and column, if it is not valid TOML."""
     try:
         found = tomllib.loads(text)
         if not too_deep(found):
@@ -144,6 +145,7 @@ class _Scanner:
     """Scans the structure of a text that `tomllib` has already checked."""
 
     def __init__(self, text: str) -> None:
+        """Scan the text, and record the lines of its keys, tables and list entries."""
         self.text = text.replace("\r\n", "\n")
         self.at = 0
         self.breaks = [match.start() for match in re.finditer("\n", self.text)]
@@ -188,6 +190,7 @@ class _Scanner:
         self._value(path)
 
     def _value(self, path: Path) -> None:
+        """Skip a value, and record the lines of what lists and inline tables in it hold."""
         first = self.text[self.at]
         if first not in "[{":
             self._skip(_STRING if first in "\"'" else _BARE)
@@ -319,6 +322,7 @@ def set_value(data: dict[str, Any], parts: list[str], value: object) -> Path:
 
 
 def _index(entries: list[Any], part: str, path: Path) -> int:
+    """Return the index of a list entry from its number or name. Raises InputError if there is no such entry."""
     if part.isdecimal():
         if int(part) < len(entries):
             return int(part)

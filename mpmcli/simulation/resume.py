@@ -178,6 +178,7 @@ def _sound_index(directory: Path) -> tuple[FrameIndex | None, int]:
 
 
 def _require_same_scene(loaded: LoadedScene, directory: Path) -> None:
+    """Raise InputError if a run cannot be resumed with a scene: more has changed than its end and the like."""
     try:
         before = tomllib.loads((directory / SCENE).read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:

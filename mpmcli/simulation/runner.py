@@ -195,6 +195,7 @@ class Runner:
     def _run_together(
         self, kind: CompiledKind, scenes: Mapping[int, Resolved]
     ) -> Iterator[tuple[int, Recording | Exception]]:
+        """Yield the recording of each scene of a kind, or its error, from runs in one batch."""
         backend = self._choose(next(iter(scenes.values())))
         batch = self._batch_for(kind, backend, len(scenes))
         runs: dict[int, Run] = {}

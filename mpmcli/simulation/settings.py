@@ -62,6 +62,7 @@ class StopCondition:
         self._written, self._seconds = size, seconds
 
     def __call__(self) -> bool:
+        """Return whether to end the run: asked by a signal, or close to the limit of time or memory."""
         if self.status:
             return True
         now = time.monotonic()

@@ -134,6 +134,7 @@ class StoredRun:
     stop: Callable[[], bool | str]
 
     def __post_init__(self) -> None:
+        """Prepare the summary, which continues that of an earlier part of the run."""
         scene, earlier = self.loaded.scene, self.earlier
         self._scene, self._directory, self._text = scene, self.settings.directory, scene_to_toml(scene)
         # Whether time.step is used even above the stable step.
@@ -275,6 +276,7 @@ class StoredRun:
             return ends
 
         def report() -> None:
+            """Add the frames sealed since the last call to record and summary, with times so far, s; tell each."""
             sealed = rows[summary.frames - kept : store.frames_written - kept]
             with clock.adding("output_s"):
                 clock.book(run.first_step_seconds, "compile_s")

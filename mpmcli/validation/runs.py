@@ -20,8 +20,7 @@ from mpmcli.output.directory import check_directory
 from mpmcli.output.durable import write_text, writing
 from mpmcli.processes.pool import Fault, in_processes
 from mpmcli.scene import Scene, parse_scene
-from mpmcli.solver.engine.run import Run as SolverRun
-from mpmcli.solver.engine.run import build_run
+from mpmcli.solver.engine.run import Run, build_run
 from mpmcli.solver.frames.diagnosis import UnstableRunError
 from mpmcli.solver.machine.backend import Backend, start_backend
 from mpmcli.validation.case import KNOBS, Case, Level, Setting
@@ -34,7 +33,7 @@ ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_
 
 
 @dataclass(frozen=True)
-class Run:
+class CaseRun:
     """One case at resolution n with one setting."""
 
     case: str
@@ -48,7 +47,7 @@ def variants(knob: str) -> list[Setting]:
     return [Setting(**{knob: value}) for value in KNOBS[knob] if value != usual]
 
 
-def runs_of(case: Case, level: Level) -> list[Run]:
+def runs_of(case: Case, level: Level) -> list[CaseRun]:
     """Return the runs of a case at a level, the default setting first, each setting from coarse to fine.
 
     The level "coarse" has the default setting, and f32 at the finest resolution. Other levels vary every field in
@@ -56,16 +55,16 @@ def runs_of(case: Case, level: Level) -> list[Run]:
     """
     resolutions = sorted(case.levels[level])
     median, finest = resolutions[(len(resolutions) - 1) // 2], resolutions[-1]
-    runs = [Run(case.name, n, Setting()) for n in resolutions]
+    runs = [CaseRun(case.name, n, Setting()) for n in resolutions]
     for knob in KNOBS:
         if knob not in case.varies or (level == "coarse" and knob != "precision"):
             continue
         at = [finest] if level == "coarse" else [median] if knob == "safety" else resolutions
-        runs += [Run(case.name, n, variant) for variant in variants(knob) for n in at]
+        runs += [CaseRun(case.name, n, variant) for variant in variants(knob) for n in at]
     return runs
 
 
-def matrix(cases: Iterable[Case], level: Level) -> list[Run]:
+def matrix(cases: Iterable[Case], level: Level) -> list[CaseRun]:
     """Return the runs of several cases, case by case."""
     return [run for case in cases for run in runs_of(case, level)]
 
@@ -98,7 +97,7 @@ class RunResult:
         return abs(self.values[measure]) if self.finished else None
 
 
-Results = Mapping[Run, RunResult]
+Results = Mapping[CaseRun, RunResult]
 
 
 def scene_of(case: Case, n: int, setting: Setting) -> Scene:
@@ -138,7 +137,7 @@ def carry_out(case: Case, n: int, setting: Setting, backend: Backend | None = No
 class SteppingClock:
     """Measures the processor time of the steps of a run, s. It excludes the time of other programs."""
 
-    def __init__(self, run: SolverRun) -> None:
+    def __init__(self, run: Run) -> None:
         self.seconds = 0.0
         self._run = run
 
@@ -158,18 +157,18 @@ class SteppingClock:
             yield found
 
 
-def carry_out_run(run: Run) -> RunResult:
+def carry_out_run(run: CaseRun) -> RunResult:
     """Carry out a run in this process."""
     return carry_out(all_cases()[run.case], run.n, run.setting)
 
 
 def carry_out_all(
-    runs: Sequence[Run],
+    runs: Sequence[CaseRun],
     workers: int,
     timeout: float = 1800.0,
     stop: Callable[[], object] = lambda: False,
-    work: Callable[[Run], RunResult] = carry_out_run,
-) -> Iterator[tuple[Run, RunResult]]:
+    work: Callable[[CaseRun], RunResult] = carry_out_run,
+) -> Iterator[tuple[CaseRun, RunResult]]:
     """Yield (run, result) as runs end; see `in_processes`. A run that crashes or exceeds `timeout` s has failed."""
     os.environ.update(ONE_THREAD)
     for run, answer in in_processes(runs, workers, work, timeout, stop):
@@ -195,19 +194,19 @@ class Journal:
             reason = getattr(error, "strerror", None) or error
             raise InputError(f"{directory} cannot be used ({reason}): give another place with -o.") from error
 
-    def find(self, run: Run) -> RunResult | None:
+    def find(self, run: CaseRun) -> RunResult | None:
         """Return the stored result of a run by the same program on this processor; None if absent or failed."""
         found = self._kept.get(run_key(run))
         return None if found is None or found["status"] == "failed" else RunResult(**found)
 
-    def keep(self, run: Run, result: RunResult) -> None:
+    def keep(self, run: CaseRun, result: RunResult) -> None:
         """Store the result of a run. Raises RunError if the file cannot be written."""
         self._kept[run_key(run)] = asdict(result)
         with writing(self._file):
             write_text(self._file, json.dumps(self._kept, indent=1) + "\n")
 
 
-def run_key(run: Run) -> str:
+def run_key(run: CaseRun) -> str:
     """Return the digest of the case, n, the scene, the program and the processor, on which times depend."""
     scene = all_cases()[run.case].scene_tables(run.n, run.setting)
     return hashlib.sha256(json.dumps([run.case, run.n, scene, *program()]).encode()).hexdigest()

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 from mpmcli.validation.case import Case, Measure, Setting
-from mpmcli.validation.runs import Results, Run
+from mpmcli.validation.runs import CaseRun, Results
 
 SINGLE = replace(Setting(), precision="f32")
 # Largest admissible ratio of errors in f32 to those in f64, if above rounding (`Measure.rounding`).
@@ -60,7 +60,7 @@ class Verdict:
         """Sentences of the failed checks."""
         return tuple(check.sentence for check in self.checks if not check.passed)
 
-    def of_run(self, run: Run) -> str:
+    def of_run(self, run: CaseRun) -> str:
         """Return "pass" or "fail" for one run; "" if no check concerns it."""
         mine = tuple(check for check in self.checks if (check.n, check.setting) == (run.n, run.setting))
         return Verdict(mine).word if mine else ""
@@ -83,7 +83,7 @@ def judge(case: Case, results: Results) -> Verdict:
     return Verdict(tuple(checks))
 
 
-def _checks_of(case: Case, run: Run, results: Results) -> Iterator[Check]:
+def _checks_of(case: Case, run: CaseRun, results: Results) -> Iterator[Check]:
     """Yield the checks of one run."""
     result, double = results[run], results.get(replace(run, setting=Setting()))
     single = run.setting == SINGLE

@@ -68,6 +68,7 @@ class ArraysFormat(Format):
         return sum(map(self._bytes, self.trajectories))
 
     def write(self, directory: Path, tick: Callable[[], None]) -> Written:
+        """Write the arrays; return the statistics of motion, or a note on why there are none."""
         self.write_arrays(directory, tick)
         why = ""
         if min(each.frame_count for each in self.trajectories) < LEAST_FRAMES:

@@ -35,6 +35,7 @@ class Gns(TrainingFormat):
     rigid_body = 0
 
     def check(self) -> None:
+        """Refuse periodic faces, and features that are unknown or ambiguous."""
         for each in self.trajectories:
             if each.source.header.periodic.any():
                 raise InputError(
@@ -72,6 +73,7 @@ class Gns(TrainingFormat):
         return sorted({name for (_, name), different in values.items() if len(different) > 1})
 
     def facts(self) -> Written:
+        """Return what determines the sizes of a GNS network, with the range of each material parameter, and notes."""
         names, d = self.parameters, self.trajectories[0].layout.dimension
         notes = [
             f"Each particle has {len(names)} parameters of its material ({', '.join(names)}): the loader of GNS takes "
@@ -99,7 +101,10 @@ class Gns(TrainingFormat):
         return np.array(numbers).reshape(len(bodies), len(self.parameters))
 
     def write_split(self, path: Path, chosen: Sequence[SubsampledTrajectory], tick: Callable[[], None]) -> None:
+        """Write an NPZ file with an object array per trajectory: positions, types, and maybe material parameters."""
+
         def entries() -> Iterable[tuple[str, np.ndarray]]:
+            """Yield the name and the object array of each trajectory, one at a time in memory."""
             m = len(self.parameters)
             for each in chosen:
                 positions = np.concatenate([block.astype(np.float32) for block in each.whole_blocks()])

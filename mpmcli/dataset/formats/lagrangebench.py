@@ -37,6 +37,7 @@ class LagrangeBench(TrainingFormat):
     wall, moving_wall, rigid_body = 1, 2, 3
 
     def check(self) -> None:
+        """Refuse periodic domains that differ, and particles that cross half of a period between two frames."""
         super().check()
         periodic = np.any([each.source.header.periodic for each in self.trajectories])
         if periodic and self._domains_differ:
@@ -86,6 +87,7 @@ class LagrangeBench(TrainingFormat):
                 tick()
 
     def _write_trajectory(self, group: h5py.Group, trajectory: SubsampledTrajectory) -> None:
+        """Write positions relative to the lower corner, m, inside the box, and particle types to a group."""
         # The layout of the file depends on the time at which objects are closed: before the next group is made.
         shape = (trajectory.frame_count, trajectory.whole_count, trajectory.layout.dimension)
         # Loaders read windows of several frames: a chunk is one window.

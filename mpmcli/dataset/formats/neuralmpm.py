@@ -42,6 +42,7 @@ class NeuralMpm(TrainingFormat):
         return {"sequence_length": self.trajectories[0].frame_count, **types}, []
 
     def write_split(self, path: Path, chosen: Sequence[SubsampledTrajectory], tick: Callable[[], None]) -> None:
+        """Write an HDF5 file per trajectory: particles, boundary, types, and gravity if it differs between them."""
         found = [each.source.header.steady_gravity for each in self.trajectories]
         differs = all(one is not None for one in found) and len({tuple(one) for one in found}) > 1
         path.mkdir()

@@ -55,6 +55,7 @@ class Parquet(ArraysFormat):
     package, extra = "pyarrow", "huggingface"
 
     def check(self) -> None:
+        """Refuse arrays whose type differs between trajectories, or that are too large for a row of a table."""
         for name, found in self._columns.items():
             if len({(array.dtype, len(array.shape)) for array in found}) > 1:
                 raise InputError(
@@ -94,6 +95,7 @@ class Parquet(ArraysFormat):
         return {"name": name, **kind}
 
     def write_arrays(self, directory: Path, tick: Callable[[], None]) -> None:
+        """Write tables with a row per trajectory, and a card and a Croissant description beside them."""
         import pyarrow as pa
         from pyarrow.parquet import ParquetWriter
 

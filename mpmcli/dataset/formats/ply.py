@@ -34,6 +34,7 @@ class Ply(Vtkhdf):
         return sum(e.particle_count * e.layout.bytes_per_particle * e.frame_count for e in self.trajectories)
 
     def write(self, directory: Path, tick: Callable[[], None]) -> Written:
+        """Write a file per frame with the particles present, and files of colliders: per frame for those that move."""
         for each in self.trajectories:
             name = group_name(each.source.number)
             groups = list(collider_groups(each.source.header.stored, each.source.colliders))

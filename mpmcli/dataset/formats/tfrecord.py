@@ -29,6 +29,7 @@ class TfRecord(Gns):
         return {"sequence_length": self.trajectories[0].frame_count - 1}, []
 
     def write_split(self, path: Path, chosen: Sequence[SubsampledTrajectory], tick: Callable[[], None]) -> None:
+        """Write a SequenceExample per trajectory, with equal bytes in every process."""
         from tfrecord import example_pb2 as types
         from tfrecord.writer import TFRecordWriter
 

@@ -47,6 +47,7 @@ class TrainingFormat(Format):
         _ = self.types
 
     def write(self, directory: Path, tick: Callable[[], None]) -> Written:
+        """Write a file per split that has trajectories; return `facts`, particle types and statistics, and notes."""
         statistics, notes = learning_facts(self.trajectories)
         facts, more = self.facts()
         notes += more

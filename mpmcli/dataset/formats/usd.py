@@ -30,6 +30,7 @@ class Usd(Vtkhdf):
         return sum(e.particle_count * e.layout.bytes_per_particle * e.frame_count for e in self.trajectories)
 
     def write(self, directory: Path, tick: Callable[[], None]) -> Written:
+        """Write a stage per trajectory: metres, seconds, a time code for each frame number."""
         from pxr import Usd as Stage
         from pxr import UsdGeom
 
@@ -55,6 +56,7 @@ class Usd(Vtkhdf):
 
 
 def _write_particles(stage: Any, trajectory: SubsampledTrajectory, codes: list[int]) -> None:
+    """Write positions, velocities, ids and fields of the particles present, at a time code for each frame."""
     from pxr import Sdf, UsdGeom, Vt
 
     points = UsdGeom.Points.Define(stage, "/World/Particles")
@@ -79,6 +81,7 @@ def _write_particles(stage: Any, trajectory: SubsampledTrajectory, codes: list[i
 
 
 def _write_collider(stage: Any, trajectory: SubsampledTrajectory, k: int, codes: list[int]) -> None:
+    """Write the surface of collider k, in 2D its outline, and its pose at each time code if it moves."""
     from pxr import Gf, Tf, UsdGeom, Vt
 
     header, collider = trajectory.source.header, trajectory.source.colliders[k]

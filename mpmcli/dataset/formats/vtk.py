@@ -31,6 +31,7 @@ class Vtkhdf(Format):
         return sum(file_size(each.layout, [each.particle_count] * each.frame_count) for each in self.trajectories)
 
     def write(self, directory: Path, tick: Callable[[], None]) -> Written:
+        """Write a VTKHDF file per trajectory; a note tells that frames or particles were left out."""
         for each in self.trajectories:
             path = directory / f"{group_name(each.source.number)}.vtkhdf"
             n, frames, layout = each.particle_count, each.frame_count, each.layout

@@ -18,6 +18,7 @@ class Webdataset(ArraysFormat):
     files = r"(train|valid|test)-\d{5}-of-\d{5}\.tar"
 
     def write_arrays(self, directory: Path, tick: Callable[[], None]) -> None:
+        """Write tar files with an NPZ and a JSON file per trajectory; their bytes depend on these alone."""
         for file, chosen in self.parts():
             with tarfile.open(directory / f"{file}.tar", "w") as archive:
                 for each in chosen:

@@ -24,6 +24,7 @@ class Zarr(ArraysFormat):
     package = extra = "zarr"
 
     def write_arrays(self, directory: Path, tick: Callable[[], None]) -> None:
+        """Write a Zarr 3 store with a group per trajectory, whose attributes are its facts."""
         import zarr
 
         root = zarr.open_group(directory / "trajectories.zarr", mode="w", zarr_format=3)

@@ -18,7 +18,7 @@ from mpmcli.scene.sampling import lattice_spacing
 from mpmcli.solver.contact.contact_phases import contact_phases, obstacles_of
 from mpmcli.solver.contact.layers import AREA, DENSITY, FRICTION, MODULUS, Layers
 from mpmcli.solver.contact.shared_field import stopped
-from mpmcli.solver.contact.surfaces import FAR, REACH, SMALLEST, BodySurfaces, place_of
+from mpmcli.solver.contact.surfaces import CONTACT_REACH, DIVISOR_FLOOR, FAR, BodySurfaces, position_of
 from mpmcli.solver.grid.grid import Grid
 from mpmcli.solver.particles.arrays import ParticleArrays
 from mpmcli.solver.particles.sort import TileOrder
@@ -61,6 +61,7 @@ class BodyContact(Feature):
         on_cpu: bool,
         couples: bool,
     ) -> None:
+        """Allocate the contact of a number of runs; `couples` is whether there are rigid bodies that move freely."""
         self.couples = couples
         self.surfaces = BodySurfaces(groups, orders, grid, layers, runs, on_cpu=on_cpu)
         self.dimension, self.layers, self.node_count = grid.dimension, layers.count, grid.node_count
@@ -129,7 +130,7 @@ class BodyContact(Feature):
 
         If it `weighs`, add only to the sums of rigid bodies what they would take.
         """
-        place = self.surfaces.place_of(at.grid, at.w, at.index)
+        place = self.surfaces.index_in_batch(at.grid, at.w, at.index)
         present = self.surfaces.present[place]
         # Layers in descending order: first all pairs of layers, then each layer with the obstacles, numbered after the
         # layers.
@@ -170,7 +171,7 @@ class BodyContact(Feature):
                     u[b] = of_c[b] / m_c - of_a[b] / m_a
         if ti.static(obstacles.any):
             if not bodies:
-                distance, normal, velocity, rough = obstacles.at(c - self.layers, place_of(node, h), REACH)
+                distance, normal, velocity, rough = obstacles.at(c - self.layers, position_of(node, h), CONTACT_REACH)
                 way, friction = distance, rough
                 for b in ti.static(range(d)):
                     facing[b] = normal[b]
@@ -184,35 +185,10 @@ class BodyContact(Feature):
         if friction < 0.0:
             for b in ti.static(range(d)):
                 J[b] = -reduced * u[b]
-        elif (bodies and a >= ti.static(int(self.surfaces.shares))) or way < REACH * h:
-            gap, n, aside, area, deepest = self.springs(at, a, c)
-            mass, implicit = reduced, IMPLICIT
-            if bodies:
-                density = ti.min(self.rows[row + a, DENSITY], self.rows[row + c, DENSITY])
-                mass = ti.max(reduced, LIGHT * density * h * area)
-            elif area < 0.0 and way <= 0.0:
-                # Material without a surface, because it was torn or crushed, is stopped behind an obstacle.
-                gap = -h
-                for b in ti.static(range(d)):
-                    n[b] = -facing[b]
-            elif ti.static(self.couples):
-                # What arrives at an overlap of up to a step leaves no faster than it came.
-                swing = at.swing(c - self.layers, 2.0 / soft * at.step.dt**2)
-                implicit = ti.max(implicit, 1.0 - 2.0 / ti.max(swing, SMALLEST))
-            kappa = 2.0 / soft * at.step.dt**2 / h * ti.max(area, 0.0) / mass
-            if gap < 0.0:
-                pushed, yields, holds = self.impulse(
-                    gap / h, u, n, aside, kappa, implicit, reduced, h / at.step.dt, friction
-                )
-                for b in ti.static(range(d)):
-                    J[b] = pushed[b]
-                if ti.static(weighs):
-                    at.weigh(c - self.layers, pushed, n, yields, ti.select(holds, reduced, 0.0))
-                else:
-                    self.loads.add(w, node, ti.static(self.pairs), 0, pushed.dot(u + pushed / reduced))
-                # Most values are not extremes, and atomic operations are slow.
-                if ti.static(not weighs) and pushed.dot(n) > 0.0 and deepest / h > self.deepest[w]:
-                    ti.atomic_max(self.deepest[w], deepest / h)
+        elif (bodies and a >= ti.static(int(self.surfaces.shares))) or way < CONTACT_REACH * h:
+            pushed = self.push(at, a, c, u, soft, reduced, friction, way, facing, weighs)
+            for b in ti.static(range(d)):
+                J[b] = pushed[b]
         if ti.static(not weighs):
             for b in ti.static(range(d)):
                 grid.nodes[at_a][b] -= J[b]
@@ -220,9 +196,64 @@ class BodyContact(Feature):
                     grid.nodes[at_c][b] += J[b]
             if ti.abs(J).max() > 0.0:
                 if bodies:
-                    self.loads.take(w, node, ti.raw_div(c * (c - 1), 2) + a, -J, place_of(node, h))
+                    self.loads.take(w, node, ti.raw_div(c * (c - 1), 2) + a, -J, position_of(node, h))
                 elif ti.static(obstacles.any):
-                    obstacles.take(c - self.layers, node, place_of(node, h), J)
+                    obstacles.take(c - self.layers, node, position_of(node, h), J)
+
+    @ti.func
+    def push(
+        self,
+        at: ti.template(),
+        a: int,
+        c: int,
+        u: ti.template(),
+        soft: float,
+        reduced: float,
+        friction: float,
+        way: float,
+        facing: ti.template(),
+        weighs: ti.template(),
+    ):
+        """Return the impulse of springs and friction from a to c at a node, N s; see `exchange`.
+
+        Args:
+            u: velocity of c relative to a, m/s.
+            soft: sum of the inverse moduli of both, 1/Pa.
+            reduced: reduced mass of both, kg.
+            friction: coefficient of friction.
+            way, facing: distance of the node from an obstacle, m, and the normal of that.
+        """
+        h, d, w = ti.static((at.grid.spacing, self.dimension, at.w))
+        J, row, bodies = ti.Vector.zero(float, d), w * self.layers, c < self.layers
+        gap, n, aside, area, deepest = self.springs(at, a, c)
+        mass, implicit = reduced, IMPLICIT
+        if bodies:
+            density = ti.min(self.rows[row + a, DENSITY], self.rows[row + c, DENSITY])
+            mass = ti.max(reduced, LIGHT * density * h * area)
+        elif area < 0.0 and way <= 0.0:
+            # Material without a surface, because it was torn or crushed, is stopped behind an obstacle.
+            gap = -h
+            for b in ti.static(range(d)):
+                n[b] = -facing[b]
+        elif ti.static(self.couples):
+            # What arrives at an overlap of up to a step leaves no faster than it came.
+            swing = at.swing(c - self.layers, 2.0 / soft * at.step.dt**2)
+            implicit = ti.max(implicit, 1.0 - 2.0 / ti.max(swing, DIVISOR_FLOOR))
+        kappa = 2.0 / soft * at.step.dt**2 / h * ti.max(area, 0.0) / mass
+        if gap < 0.0:
+            pushed, yields, holds = self.impulse(
+                gap / h, u, n, aside, kappa, implicit, reduced, h / at.step.dt, friction
+            )
+            for b in ti.static(range(d)):
+                J[b] = pushed[b]
+            if ti.static(weighs):
+                at.weigh(c - self.layers, pushed, n, yields, ti.select(holds, reduced, 0.0))
+            else:
+                self.loads.add(w, at.node, ti.static(self.pairs), 0, pushed.dot(u + pushed / reduced))
+            # Most values are not extremes, and atomic operations are slow.
+            if ti.static(not weighs) and pushed.dot(n) > 0.0 and deepest / h > self.deepest[w]:
+                ti.atomic_max(self.deepest[w], deepest / h)
+        return J
 
     @ti.func
     def impulse(
@@ -280,7 +311,7 @@ class BodyContact(Feature):
         for images in range(ti.static(grid.images.by_period.sets)):
             there, exists = grid.images.by_period.image_from_inside(at.node, images)
             if exists:
-                place = self.surfaces.place_of(grid, at.w, grid.linear_index(there))
+                place = self.surfaces.index_in_batch(grid, at.w, grid.linear_index(there))
                 for q in range(ti.static(grid.scheme.spline.nodes**d)):
                     before, inside = self.surfaces.stencil_before(grid, there, q)
                     if inside:
@@ -319,15 +350,42 @@ class BodyContact(Feature):
                                             for b in ti.static(range(d)):
                                                 ways[side, b] += ti.abs(share) * size * way[b]
                                 p = self.surfaces.following[g][p]
+        overlap, axis, aside = self.mean_overlap(c, area, force, weights, pushes, ways, slopes)
+        if seen == 0.0:
+            area = -1.0
+        return -overlap, axis, aside, area, deepest
+
+    @ti.func
+    def mean_overlap(
+        self,
+        c: int,
+        area: float,
+        total: ti.template(),
+        weights: ti.template(),
+        pushes: ti.template(),
+        ways: ti.template(),
+        slopes: ti.template(),
+    ):
+        """Return the mean overlap at a node, m, its direction, and the correction `aside` of `springs`.
+
+        Args:
+            c: layer, or obstacle.
+            area: of the points.
+            total: sum of their overlaps, times area.
+            weights, pushes: per side, the sums of their weights, and of their overlaps times area.
+            ways, slopes: per side, sums of the ways from the points to the node times overlap and area, and of their
+                rates of strain times weight.
+        """
+        d = ti.static(self.dimension)
         # Divided first, because the squares of weights may be too small for single precision.
-        force /= ti.max(area, SMALLEST)
+        force = total / ti.max(area, DIVISOR_FLOOR)
         overlap = force.norm()
-        axis = force / ti.max(overlap, SMALLEST)
+        axis = force / ti.max(overlap, DIVISOR_FLOOR)
         # Distances of the node from the surfaces: their sum is the gap.
         far = ti.Vector.zero(float, 2)
         for side, b in ti.static(ti.ndrange(2, d)):
-            slopes[side, b] /= ti.max(weights[side], SMALLEST)
-            far[side] += (1.0 - 2.0 * side) * ways[side, b] * axis[b] / ti.max(pushes[side], SMALLEST)
+            slopes[side, b] /= ti.max(weights[side], DIVISOR_FLOOR)
+            far[side] += (1.0 - 2.0 * side) * ways[side, b] * axis[b] / ti.max(pushes[side], DIVISOR_FLOOR)
         if c < self.layers:
             for side in ti.static(range(2)):
                 if pushes[side] == 0.0:
@@ -335,6 +393,4 @@ class BodyContact(Feature):
         aside = ti.Vector.zero(float, d)
         for b in ti.static(range(d)):
             aside[b] = far[0] * slopes[0, b] - far[1] * slopes[1, b]
-        if seen == 0.0:
-            area = -1.0
-        return -overlap, axis, aside, area, deepest
+        return overlap, axis, aside

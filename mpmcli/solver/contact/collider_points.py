@@ -19,9 +19,9 @@ from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
 from mpmcli.solver.transfer.splines import QuadraticSpline
 
-# A point acts if the share of its kernel that is filled is FULL or more, not at all up to EMPTY. The share falls from 1
-# to 0.8, 0.54, 0.34 if material stands off by 0.1, 0.3, 0.5 cells, wherever the nodes are.
-EMPTY, FULL = 0.5, 0.8
+# A point acts in full if the share of its kernel that is filled is ACTS_FULLY or more, not at all up to ACTS_FROM. The
+# share falls from 1 to 0.8, 0.54, 0.34 if material stands off by 0.1, 0.3, 0.5 cells, wherever the nodes are.
+ACTS_FROM, ACTS_FULLY = 0.5, 0.8
 # Between these shares the weights of nodes that lack material rise from their filled part to the whole: the former lets
 # material come near, the latter makes less noise where it rests.
 PART, WHOLE = 0.75, 0.9
@@ -115,6 +115,7 @@ class ColliderPoints(Feature):
         return changed(self, run=view.w, colliders=view.features.colliders)
 
     def phases(self, **_how: bool) -> tuple[Phase, ...]:
+        """Return the phases that find points and their impulses, in rounds if rigid bodies are met, and push nodes."""
         found = [
             *[Phase("fill_solids", "nodes", "scatter", body=fill_solids, wanted=near_row)] * self.fills,
             Phase("find_points", "nodes", "points", body=find_points, wanted=new_row, words="find points of colliders"),
@@ -155,7 +156,7 @@ class ColliderPoints(Feature):
     @ti.func
     def place(self, index: int):
         """Return the index of a node of layer 0 in the fields of nodes, given that in the grid."""
-        return index - self.run * ti.static((self.layers - 1) * self.node_count)
+        return index - self.run * ((self.layers - 1) * self.node_count)
 
     @ti.func
     def row_of(self, node: ti.template()):
@@ -165,7 +166,7 @@ class ColliderPoints(Feature):
     @ti.func
     def near_row(self, node: ti.template()):
         """Return whether a collider may cut the kernel of a node of the row that begins at a node."""
-        x, result = self.colliders.place_of(node), False
+        x, result = self.colliders.position_of(node), False
         for k in range(self.colliders.count[self.run]):
             i = self.run * self.colliders.capacity + k
             result = result or self.colliders.covers(i, x, self.colliders.beyond(), self.dimension - 1)
@@ -246,7 +247,7 @@ class ColliderPoints(Feature):
     @ti.func
     def visit(self, walls: ti.template(), extent: ti.template(), node: ti.template(), own: int, first: int):
         """Return the number of points of a node; write them from index `first` on, unless it is negative."""
-        h, x, found = self.colliders.spacing, self.colliders.place_of(node), 0
+        h, x, found = self.colliders.spacing, self.colliders.position_of(node), 0
         for k in range(self.colliders.count[self.run]):
             i = self.run * self.colliders.capacity + k
             if self.colliders.wall[i] != HOLD and self.colliders.covers(i, x):
@@ -340,7 +341,7 @@ class ColliderPoints(Feature):
         if full > 0.0:
             for c in range(self.stencil):
                 share += self.weight(along, c) * ti.min(ti.abs(self.weights[p * self.stencil + c]) / full, 1.0)
-        acts = smooth((share - EMPTY) / (FULL - EMPTY))
+        acts = smooth((share - ACTS_FROM) / (ACTS_FULLY - ACTS_FROM))
         whole = 0.0 if self.colliders.wall[i] == STICK else smooth((share - PART) / (WHOLE - PART))
         for c in range(self.stencil):
             weight = 0.0
@@ -354,7 +355,7 @@ class ColliderPoints(Feature):
                 own, _sign = images.owner(other)
                 self.spread[self.place(grid.linear_index(own))] = -1.0
                 self.marked[self.row_of(own)] = 1
-                centre += weight * self.colliders.place_of(other)
+                centre += weight * self.colliders.position_of(other)
             self.weights[p * self.stencil + c] = weight
             total += weight
         self.share[p], self.gain[p] = total, acts

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from mpmcli.boundaries.feature import Phase
 from mpmcli.quick_taichi import ti
-from mpmcli.solver.contact.surfaces import Obstacles, place_of
+from mpmcli.solver.contact.surfaces import Obstacles, position_of
 from mpmcli.solver.grid.grid import Grid
 from mpmcli.solver.particles.arrays import ParticleArrays
 
@@ -103,7 +103,7 @@ class ContactNode:
         """
         rigid, loads, d = ti.static((self.rigid, self.rigid.colliders.loads, self.grid.dimension))
         _k, i = self.obstacles.collider_of(o)
-        arm = place_of(self.node, self.grid.spacing) - rigid.colliders.place[i]
+        arm = position_of(self.node, self.grid.spacing) - rigid.colliders.place[i]
         row = (self.w * loads.rows + loads.row_of(self.node)) * rigid.count + self.rigid_of(o)
         load = loads.of(impulse, arm)
         for a in ti.static(range(rigid.loads)):
@@ -228,7 +228,7 @@ def at_bins(phases: ti.template(), at: ti.template(), do: ti.template()):
     (grid,) = ti.static(near_bodies(phases, at))
     if at.q < grid.box_nodes():
         (surfaces,) = ti.static((phases.device.features.contact.surfaces,))
-        place = surfaces.place_of(grid, at.w, grid.linear_index(grid.box_node(at.q)))
+        place = surfaces.index_in_batch(grid, at.w, grid.linear_index(grid.box_node(at.q)))
         ti.static(do)(at.w, place)
 
 

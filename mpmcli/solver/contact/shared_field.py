@@ -5,9 +5,9 @@
 
 from mpmcli.boundaries.colliders import DEEP
 from mpmcli.quick_taichi import ti
-from mpmcli.solver.contact.collider_points import EMPTY, FREE, FULL, LEAST, smooth
+from mpmcli.solver.contact.collider_points import ACTS_FROM, ACTS_FULLY, FREE, LEAST, smooth
 from mpmcli.solver.contact.layers import DENSITY
-from mpmcli.solver.contact.surfaces import ALIKE, SMALLEST, place_of
+from mpmcli.solver.contact.surfaces import ALIKE, DIVISOR_FLOOR, position_of
 from mpmcli.solver.transfer.splines import PAD
 
 
@@ -27,10 +27,10 @@ def stopped(contact: ti.template(), at: ti.template(), c: int, u: ti.template(),
             # Light nodes would follow the field, which crushes the outermost particles of the body.
             share = 0.0
         elif approach > 0.0 and far > DEEP * h:
-            filled = share_filled(contact, at, c, place_of(at.node, h) - far * n)
-            share = smooth((filled - EMPTY) / (FULL - EMPTY))
+            filled = share_filled(contact, at, c, position_of(at.node, h) - far * n)
+            share = smooth((filled - ACTS_FROM) / (ACTS_FULLY - ACTS_FROM))
         along = u - u.dot(n) * n
-        rub = ti.min(friction * approach, along.norm()) / ti.max(along.norm(), SMALLEST)
+        rub = ti.min(friction * approach, along.norm()) / ti.max(along.norm(), DIVISOR_FLOOR)
         for b in ti.static(range(d)):
             change[b] = -share * (approach * n[b] + rub * along[b])
     return change
@@ -44,7 +44,7 @@ def surface_of(contact: ti.template(), at: ti.template(), c: int):
     for images in range(ti.static(grid.images.by_period.sets)):
         there, exists = grid.images.by_period.image_from_inside(at.node, images)
         if exists:
-            place = surfaces.place_of(grid, at.w, grid.linear_index(there))
+            place = surfaces.index_in_batch(grid, at.w, grid.linear_index(there))
             for q in range(ti.static(grid.scheme.spline.nodes**d)):
                 before, inside = surfaces.stencil_before(grid, there, q)
                 if inside:
@@ -62,7 +62,7 @@ def surface_of(contact: ti.template(), at: ti.template(), c: int):
                                 for b in ti.static(range(d)):
                                     n[b] += weight * surfaces.surface[g][p][b]
                             p = surfaces.following[g][p]
-    return n.normalized(SMALLEST), far / ti.max(seen, SMALLEST), seen
+    return n.normalized(DIVISOR_FLOOR), far / ti.max(seen, DIVISOR_FLOOR), seen
 
 
 @ti.func

@@ -11,8 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mpmcli.boundaries.colliders import REACH as COLLIDERS_REACH
-from mpmcli.boundaries.colliders import SEPARATE, Colliders
+from mpmcli.boundaries.colliders import COLLIDER_REACH, SEPARATE, Colliders
 from mpmcli.boundaries.walls import Walls
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Body
@@ -25,13 +24,13 @@ from mpmcli.solver.transfer.splines import PAD
 
 # Distance from a surface, cells, beyond which nodes are not in contact: half the support of the spline that distributes
 # it.
-REACH = 1.5
+CONTACT_REACH = 1.5
 # Distance of an obstacle that is absent or does not act, m; and a node index beyond any grid.
 FAR, ALL_NODES = 1e30, 2**20
 # Product of two normals, or of a normal and an axis, above which they have the same direction.
 ALIKE = 0.7
 # A number that replaces 0 in divisors and logarithms.
-SMALLEST = 1e-37
+DIVISOR_FLOOR = 1e-37
 
 
 @ti.data_oriented
@@ -104,7 +103,7 @@ class Obstacles:
                     beyond = ti.max(
                         beyond, self.colliders.reach[i][0, a] - arm[a], arm[a] - self.colliders.reach[i][1, a]
                     )
-                beyond += COLLIDERS_REACH * h
+                beyond += COLLIDER_REACH * h
                 if acts and beyond > reach * h:
                     distance = beyond
                 elif acts:
@@ -139,7 +138,7 @@ class Obstacles:
             k, i = self.collider_of(o)
             if k >= 0:
                 # A margin beyond the reach stored with the collider, and for rounding.
-                wider = ti.static(REACH - COLLIDERS_REACH + 0.1)
+                wider = ti.static(CONTACT_REACH - COLLIDER_REACH + 0.1)
                 for a in ti.static(range(self.dimension)):
                     place = self.colliders.place[i][a]
                     first = (place + self.colliders.reach[i][0, a]) / self.spacing - wider
@@ -158,7 +157,7 @@ class Obstacles:
 
 
 @ti.func
-def place_of(node: ti.template(), spacing: float):
+def position_of(node: ti.template(), spacing: float):
     """Return the position of a node relative to the lower corner, m."""
     return ti.cast(node - PAD, float) * spacing
 
@@ -248,6 +247,7 @@ class BodySurfaces:
         *,
         on_cpu: bool,
     ) -> None:
+        """Allocate the surfaces of groups for a number of runs; on a GPU also the counts and slots of bins."""
         d = self.dimension = grid.dimension
         self.layers, self.shares, self.runs = layers.count, layers.shares, runs
         self.groups, self.orders = tuple(groups), tuple(orders)
@@ -286,8 +286,17 @@ class BodySurfaces:
                 self.low[layer][a], self.high[layer][a] = 2**30, -(2**30)
 
     @ti.func
-    def widen(self, layer: int, base: ti.template()):
-        """Extend the range of a layer, counted over all runs, to a stencil."""
+    def used_by(self, w: int, layer: int):
+        """Return the box in use of a layer of run w, as in `Grid.box`."""
+        own = ti.Matrix.zero(int, 2, self.dimension)
+        for i, a in ti.static(ti.ndrange(2, self.dimension)):
+            own[i, a] = self.used[(w * self.layers + layer) * 2 + i, a]
+        return own
+
+    @ti.func
+    def widen(self, w: int, of_run: int, base: ti.template()):
+        """Extend the range of a layer of run w to a stencil."""
+        layer = w * self.layers + of_run
         for a in ti.static(range(self.dimension)):
             # The comparisons may use old values; they avoid most atomic operations on a GPU.
             if base[a] < self.low[layer][a]:
@@ -334,8 +343,8 @@ class BodySurfaces:
                     end = ti.min(self.high[layer] + drift + reach, last_met)
                     if (end - first).min() >= reach:
                         middle, radius = self.ball_of(first, end, obstacles.spacing)
-                        distance, _n, _v, _f = obstacles.at(o, middle, radius / obstacles.spacing + REACH)
-                        if distance < radius + REACH * obstacles.spacing:
+                        distance, _n, _v, _f = obstacles.at(o, middle, radius / obstacles.spacing + CONTACT_REACH)
+                        if distance < radius + CONTACT_REACH * obstacles.spacing:
                             low, high = ti.min(low, first), ti.max(high, end)
         for a in ti.static(range(d)):
             first_used, count = grid.box[2 * w, a], grid.box[2 * w + 1, a]
@@ -349,8 +358,8 @@ class BodySurfaces:
         return 0.5 * spacing * (low + high), 0.5 * spacing * (high - low).norm()
 
     @ti.func
-    def place_of(self, grid: ti.template(), w: int, index: int):
-        """Return the index of a node in `present` and `first`, given its linear index in layer 0."""
+    def index_in_batch(self, grid: ti.template(), w: int, index: int):
+        """Return the index of a node among those of all runs, as in `first`, given its linear index in layer 0."""
         return index - grid.first_node + w * ti.static(self.node_count)
 
     @ti.func
@@ -358,7 +367,7 @@ class BodySurfaces:
         """Clear rows of nodes of the box, which is the box of `grid` here and below."""
         for row in range(first, after):
             node = grid.row_start(row)
-            place = self.place_of(grid, w, grid.linear_index(node))
+            place = self.index_in_batch(grid, w, grid.linear_index(node))
             for k in range(grid.row_length(node)):
                 stay_rolled(self.orders[0].buffers.real, place + k)
                 self.clear(place + k)
@@ -388,7 +397,7 @@ class BodySurfaces:
                     inside = inside and beyond >= 0 and beyond < self.used[used + 1, a]
                 if inside:
                     index = grid.linear_index(node) - node[last]
-                    place = self.place_of(grid, w, index)
+                    place = self.index_in_batch(grid, w, index)
                     for k in range(begin, end):
                         stay_rolled(self.orders[0].buffers.real, place + k)
                         node[last] = k
@@ -397,15 +406,15 @@ class BodySurfaces:
         for row in range(first, after):
             node = grid.row_start(row)
             # `far` is the node up to which no obstacle is near.
-            place, far = self.place_of(grid, w, grid.linear_index(node)), node[last]
+            place, far = self.index_in_batch(grid, w, grid.linear_index(node)), node[last]
             for k in range(grid.row_length(node)):
                 bodies = self.bodies_at(place + k)
                 met = ti.cast(self.present[place + k] > 255, int)
                 if ti.static(obstacles.any):
                     if bodies > 0 and node[last] >= far:
-                        cells = obstacles.nearest(place_of(node, grid.spacing), REACH) * grid.inverse_spacing
-                        met += 2 * ti.cast(cells < REACH, int)
-                        far = node[last] + ti.cast(ti.min(ti.max(cells - REACH, 0.0), 1e6), int)
+                        cells = obstacles.nearest(position_of(node, grid.spacing), CONTACT_REACH) * grid.inverse_spacing
+                        met += 2 * ti.cast(cells < CONTACT_REACH, int)
+                        far = node[last] + ti.cast(ti.min(ti.max(cells - CONTACT_REACH, 0.0), 1e6), int)
                 self.open_bins(grid, node, place + k, met)
                 node[last] += 1
 
@@ -447,7 +456,7 @@ class BodySurfaces:
     def find(self, grid: ti.template(), obstacles: ti.template(), w: int, node: ti.template()):
         """Find which layers have mass at a node, and whether they may be in contact, like `find_rows`."""
         index = grid.linear_index(node)
-        place = self.place_of(grid, w, index)
+        place = self.index_in_batch(grid, w, index)
         present = ti.cast(0, ti.i64)
         for layer in range(self.count[w]):
             used, inside = 2 * (w * self.layers + layer), True
@@ -462,7 +471,8 @@ class BodySurfaces:
         met = ti.cast(present > 255, int)
         if ti.static(obstacles.any):
             if bodies > 0:
-                met += 2 * ti.cast(obstacles.nearest(place_of(node, grid.spacing), REACH) < REACH * grid.spacing, int)
+                distance = obstacles.nearest(position_of(node, grid.spacing), CONTACT_REACH)
+                met += 2 * ti.cast(distance < CONTACT_REACH * grid.spacing, int)
         self.open_bins(grid, node, place, met)
 
     @ti.func
@@ -481,7 +491,7 @@ class BodySurfaces:
                 after = ti.raw_div(rest, end[a] - first[a])
                 node[a] += rest - after * (end[a] - first[a])
                 rest = after
-            place = self.place_of(grid, w, grid.linear_index(node))
+            place = self.index_in_batch(grid, w, grid.linear_index(node))
             for k in range(end[last] - first[last]):
                 stay_rolled(self.orders[0].buffers.real, place + k)
                 found = found or self.first[g][place + k] != CLOSED
@@ -548,7 +558,7 @@ class BodySurfaces:
     @ti.func
     def bin_of(self, grid: ti.template(), w: int, base: ti.template()):
         """Return the bin of the stencils that begin at a node, or -1 outside the box."""
-        place = self.place_of(grid, w, grid.linear_index(base))
+        place = self.index_in_batch(grid, w, grid.linear_index(base))
         for a in ti.static(range(self.dimension)):
             if base[a] < grid.box[0, a] or base[a] >= grid.box[0, a] + grid.box[1, a]:
                 place = -1

@@ -14,11 +14,12 @@ from mpmcli.boundaries.feature import Feature
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import SolverSettings
 from mpmcli.scene.domain import SEPARATING
+from mpmcli.solver.contact.surfaces import EMPTY
 from mpmcli.solver.grid.grid import Grid
 from mpmcli.solver.particles.arrays import MASS, VOLUME, ParticleArrays
 
 # A body that starts within this distance, cells, of a slipping or sticking wall is permanently held by that wall.
-HELD = 1.0
+HOLDING_DISTANCE = 1.0
 
 
 @ti.func
@@ -86,7 +87,7 @@ def overlap_of(
     overlap = ti.min(0.5 * spacing, at_rest) * stretched - distance
     meets = overlap > 0.0
     if ti.static(particles.faces[a][side] not in SEPARATING):
-        meets = meets and at_rest >= HELD * particles.grid.spacing
+        meets = meets and at_rest >= HOLDING_DISTANCE * particles.grid.spacing
     return overlap, meets
 
 
@@ -145,7 +146,8 @@ BIN, DRIFT = 2, 0.2
 # Distance from which two particles repel each other, in spacings. The force of a row of particles is then a sum over
 # several of them and hardly depends on the position along the row.
 RANGE = 1.5
-EMPTY, SEVERAL = -1, -2
+# Owner of a bin with particles of several bodies.
+SEVERAL = -2
 
 
 def bins_along(cells: Sequence[int]) -> tuple[int, ...]:

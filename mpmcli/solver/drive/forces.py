@@ -23,7 +23,7 @@ from mpmcli.solver.particles.arrays import ParticleArrays
 from mpmcli.solver.particles.state_bounds import build_maxima
 
 # Half of the interval of the central differences for the gradient of a force, cells.
-REACH = 0.5
+HALF_INTERVAL = 0.5
 # A gradient beyond this counts as zero, like NaN where a force is undefined next to a particle.
 STEEPEST = 1e30
 # Forces are measured together with the state, for the steps until the next measurement. Forces that depend on time are
@@ -86,7 +86,7 @@ class ForceTerms:
             )
             terms.append(Term(-1 if force.body is None else names.index(force.body), axes))
             found.update(*map(names_in, trees))
-        reach, drags = REACH * scene.domain.spacing, not found.isdisjoint(VELOCITY)
+        reach, drags = HALF_INTERVAL * scene.domain.spacing, not found.isdisjoint(VELOCITY)
         return ForceTerms(
             tuple(terms),
             not found.isdisjoint(POSITION),
@@ -157,6 +157,7 @@ class DriveValues:
     """
 
     def __init__(self, drives: Drives, runs: int, *, doubles: bool = True) -> None:
+        """Allocate the numbers of all runs; without double precision, `doubles`, there are no tables."""
         timed = [k for k, depends in enumerate(drives.timed) if depends]
         self.device = DeviceValues(runs, len(drives.timed))
         self.timed = tuple(enumerate(timed))

@@ -10,8 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from mpmcli.boundaries.mirror_images import MirrorImages
-from mpmcli.boundaries.walls import REACH as WALLS_REACH
-from mpmcli.boundaries.walls import Walls, faces_on_grid
+from mpmcli.boundaries.walls import IMAGE_DEPTH, Walls, faces_on_grid
 from mpmcli.errors import RunError
 from mpmcli.quick_taichi import ti
 from mpmcli.solver.contact.total_solids import DRIFT, slips_in
@@ -25,6 +24,7 @@ from mpmcli.solver.engine.run_state import FRAME_NUMBERS, MOST_FRAMES, Layout, R
 from mpmcli.solver.engine.step_size import StepSize
 from mpmcli.solver.features import Features
 from mpmcli.solver.frames.reader import sum_entries
+from mpmcli.solver.grid.fine_grid import FineBlocks, FineGrid
 from mpmcli.solver.grid.fixed_point import FixedPoint
 from mpmcli.solver.grid.grid import Grid, drift_allowed, node_width, tile_edge
 from mpmcli.solver.grid.period import Period
@@ -39,8 +39,7 @@ from mpmcli.solver.machine.backend import Backend
 from mpmcli.solver.particles.arrays import CONSTANTS, ParticleArrays
 from mpmcli.solver.particles.sort import CellOrder, SortBuffers, TileOrder
 from mpmcli.solver.transfer.node_update import NodeUpdate
-from mpmcli.solver.transfer.particle_update import BEYOND, ParticleUpdate
-from mpmcli.solver.transfer.redistribution import FineBlocks, FineGrid
+from mpmcli.solver.transfer.particle_update import OPEN_MARGIN, ParticleUpdate
 from mpmcli.solver.transfer.run_sums import scatters_runs
 from mpmcli.solver.transfer.splines import PAD, scheme_of
 from mpmcli.solver.transfer.volume import averages_volume, levels_volume
@@ -76,6 +75,7 @@ class Batch:
     """
 
     def __init__(self, kind: CompiledKind, backend: Backend, runs: int = 1) -> None:
+        """Allocate the fields and features of a kind for a number of runs, and make the launcher of the backend."""
         sys.setrecursionlimit(max(sys.getrecursionlimit(), RECURSION))
         d = kind.dimension
         self.kind, self.runs, self.backend = kind, runs, backend
@@ -83,30 +83,10 @@ class Batch:
         # Many small runs on a GPU fit its cache; they are not sorted and use all nodes of their domains.
         sorts = on_cpu or runs == 1 or kind.inflow.any or kind.layers.separate
         scheme = scheme_of(kind.settings, keeps_flip_velocity=kind.keeps_motion)
-        averaged = [averages_volume(kind.settings, law) for law in kind.members]
         period = Period(kind.faces, runs, at_once=not on_cpu)
         deterministic = kind.settings.deterministic and not on_cpu
         grid = self._make_grid(period, room_for_blocks(sum(kind.particles)), deterministic=deterministic)
-        groups = [
-            ParticleArrays(
-                law,
-                runs * capacity,
-                (runs * bodies, CONSTANTS + len(law.constants(law.members[0]))),
-                kind.layers,
-                # Forces select the particles of their body.
-                many_bodies=runs > 1 or bodies > 1 or bool(forces.terms),
-                serial=on_cpu and backend.threads == 1,
-                keeps_initial=forces.initial,
-                total=kind.settings.solids == "total",
-                uses_f_bar=shares,
-                levels=levels_volume(kind.settings, law),
-                has_wall_friction=slips_in(kind.settings, kind.rough),
-                particle_count_varies=kind.inflow.any,
-            )
-            for law, shares, capacity, bodies, forces in zip(
-                kind.members, averaged, kind.particles, kind.bodies, kind.drives.forces, strict=True
-            )
-        ]
+        groups = self._make_groups(serial=on_cpu and backend.threads == 1)
         self.values = DriveValues(kind.drives, runs, doubles=backend.doubles)
         self.pushes = [
             push_on(group, forces, bodies, self.values.device, backend)
@@ -122,7 +102,7 @@ class Batch:
         friction, moving = features.friction, features.moving
         faces = faces_on_grid(kind.faces, kind.settings)
         walls = Walls(faces, PAD, grid.cells, grid.shape, runs * grid.layers, friction, moving)
-        walls.shut = 0 if kind.layers.shares else -WALLS_REACH
+        walls.shut = 0 if kind.layers.shares else -IMAGE_DEPTH
         images = MirrorImages(walls, scheme.spline.on_node, on_cpu=on_cpu)
         watched = sorts and not on_cpu
         self.device = Device(
@@ -159,6 +139,29 @@ class Batch:
         else:
             self.gpu = GpuLaunch(self.device, self.layout, doubles=backend.doubles)
 
+    def _make_groups(self, *, serial: bool) -> list[ParticleArrays]:
+        """Allocate the particles of each law; `serial`: see `ParticleArrays`."""
+        kind, runs = self.kind, self.runs
+        of_laws = zip(kind.members, kind.particles, kind.bodies, kind.drives.forces, strict=True)
+        return [
+            ParticleArrays(
+                law,
+                runs * capacity,
+                (runs * bodies, CONSTANTS + len(law.constants(law.members[0]))),
+                kind.layers,
+                # Forces select the particles of their body.
+                many_bodies=runs > 1 or bodies > 1 or bool(forces.terms),
+                serial=serial,
+                keeps_initial=forces.initial,
+                total=kind.settings.solids == "total",
+                uses_f_bar=averages_volume(kind.settings, law),
+                levels=levels_volume(kind.settings, law),
+                has_wall_friction=slips_in(kind.settings, kind.rough),
+                particle_count_varies=kind.inflow.any,
+            )
+            for law, capacity, bodies, forces in of_laws
+        ]
+
     def _drift_allowed(self, grid: Grid, *, repels: bool) -> float:
         """Return the largest drift of particles before a sort, cells."""
         if repels:
@@ -167,7 +170,7 @@ class Batch:
             return drift_allowed(grid.tile, grid.scheme.spline.nodes)
         # The nodes in use include a drift of one tile. One cell is reserved for the last step before a sort; particles
         # beyond an open face are retired before they leave the grid.
-        return BEYOND - 1 if self.kind.inflow.opens else grid.tile - 1.0
+        return OPEN_MARGIN - 1 if self.kind.inflow.opens else grid.tile - 1.0
 
     def _make_grid(self, period: Period, blocks: int, *, deterministic: bool = False) -> Grid:
         """Return the grid; a sparse grid is allocated with `blocks` blocks."""

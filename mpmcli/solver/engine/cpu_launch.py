@@ -50,6 +50,7 @@ class CpuLaunch:
     """
 
     def __init__(self, device: Device, layout: Layout) -> None:
+        """Build the phases, the team of threads and the choice of steps of a device."""
         self.device, self.layout = device, layout
         self.dimension, self.capacity = device.grid.dimension, tuple(device.capacity)
         self.members, self.stencils = tuple(enumerate(device.groups)), device.stencils
@@ -207,8 +208,7 @@ class CpuLaunch:
                 base = view.orders[g].first_node_of(p)
                 low, high = ti.min(low, base), ti.max(high, base)
                 if ti.static(self.phases.separates):
-                    layer = run.w * ti.static(self.device.grid.layers) + view.groups[g].layer_of(p)
-                    self.device.features.surfaces.widen(layer, base)
+                    self.device.features.surfaces.widen(run.w, view.groups[g].layer_of(p), base)
             if ti.static(self.phases.shared):
                 self.phases.places.divide(g, own)
         for a in ti.static(range(self.dimension)):

@@ -17,11 +17,10 @@ from mpmcli.quick_taichi import ti
 from mpmcli.solver.contact.contact_phases import clear_part
 from mpmcli.solver.engine.device import Device, RunPhases, RunView, Work
 from mpmcli.solver.engine.run_state import Layout
-from mpmcli.solver.engine.step import sorted_fields
-from mpmcli.solver.frames.reader import write_range
+from mpmcli.solver.frames.reader import FrameRows, turns
 from mpmcli.solver.grid.grid import clear_blocks, clear_rows
 from mpmcli.solver.grid.sparse_grid import BLOCKS, PENCILS
-from mpmcli.solver.particles.loop import over
+from mpmcli.solver.particles.loop import in_window, over
 from mpmcli.solver.particles.sort import (
     count_tiles,
     keep_all,
@@ -40,7 +39,7 @@ from mpmcli.solver.transfer.cpu_transfers import (
     update_blocks,
     update_rows,
 )
-from mpmcli.solver.transfer.volume import AVERAGE, average_for_frame
+from mpmcli.solver.transfer.volume import average_for_frame
 
 # Arrays of all runs: numbers, counts and frame buffer, see `Batch`.
 RunReals = ti.types.ndarray(ti.f64, 2)
@@ -58,11 +57,8 @@ class PartKind(NamedTuple):
         name: name of the phases.
         group: index of the group of particles.
         first, after: number of the first phase, and of the one after the last.
-        body: name of the method.
-        part: function of a part, in place of a method.
-        item: function for each node or particle, for methods that only loop.
-        wanted: function that tells whether a row of nodes has work, see `Phase`.
-        shifts: whether the phases belong to the shift of particles.
+        body: name of the method, for phases without functions.
+        phase: the phase of a step that it is, or None.
     """
 
     name: str
@@ -70,10 +66,12 @@ class PartKind(NamedTuple):
     first: int
     after: int
     body: str
-    part: Callable | None
-    item: Callable | None
-    wanted: Callable | None
-    shifts: bool
+    phase: Phase | None
+
+    @property
+    def part(self) -> Callable | None:
+        """The function of a part of all items, of phases that divide their work themselves."""
+        return self.phase and self.phase.part
 
 
 class Part(Work):
@@ -90,9 +88,8 @@ class Part(Work):
 
     def __init__(self, view: RunView, kind: PartKind, turn: object, *variables: object) -> None:
         """Store a view and variables of a kernel."""
-        super().__init__(view, kind.group, kind.item, turn)
+        super().__init__(view, kind.group, kind.phase, turn)
         self.region, self.part, self.t, self.frame_buffer = variables
-        self.wanted, self.shifts = kind.wanted, kind.shifts
 
 
 @ti.data_oriented
@@ -235,6 +232,7 @@ class CpuPhases(RunPhases):
     """
 
     def __init__(self, device: Device, layout: Layout) -> None:
+        """Number the phases of a step, of a sort and of a frame."""
         super().__init__(device, layout)
         self.shared = device.runs == 1 and device.threads > 1
         self.regions = device.threads if self.shared else 1
@@ -265,7 +263,7 @@ class CpuPhases(RunPhases):
             for g, _ in self.members:
                 end = self._add("mark", g, self.marking, 1)
         # Phases of the sort per group: count, place, and two copies (keep and take) per field.
-        self.moved = sorted_fields(device.groups)
+        self.moved = tuple(group.moved for group in device.groups)
         self.sorts_of = ()
         for g, fields in enumerate(self.moved):
             self.sorts_of += (end,)
@@ -281,12 +279,10 @@ class CpuPhases(RunPhases):
 
     def _add(self, name: str, group: int, first: int, length: int, phase: Phase | None = None) -> int:
         """Number phases, and return the number after the last."""
-        item, body = phase and phase.body, name
-        if item:
-            body = "each_node" if phase.over == "nodes" else "each_in_pencils" if phase.adds else "each_particle"
-            body = "shift_nodes" if body == "each_node" and phase.shifts else body
-        functions = (phase.part, item, phase.wanted, phase.shifts) if phase else (None, None, None, False)
-        self.kinds += (PartKind(name, group, first, first + length, body, *functions),)
+        body = name
+        if phase and phase.body:
+            body = "each_particle" if phase.over == "particles" else "shift_nodes" if phase.shifts else "each_node"
+        self.kinds += (PartKind(name, group, first, first + length, body, phase),)
         return first + length
 
     def body(self, kind: PartKind) -> object:
@@ -372,7 +368,7 @@ class CpuPhases(RunPhases):
             nodes_of_blocks(at, at.grid.pencils[first], at.grid.pencils[after], at.step.kick)
         else:
             first, after = self.places.rows_of(at)
-            if ti.static(at.wanted):
+            if ti.static(at.phase.wanted):
                 own = self.used_by(at, 0)
                 (inner,) = ti.static((at.in_layer(0, own),))
                 nodes_of_rows(inner, first, after, inner.step.kick)
@@ -391,23 +387,39 @@ class CpuPhases(RunPhases):
             node = at.grid.row_start(row)
             for _ in range(at.grid.row_length(node)):
                 stay_rolled(at.order.buffers.real, node[last_axis])
-                ti.static(at.item)(at, node, at.step.relaxed)
+                ti.static(at.phase.body)(at, node, at.step.relaxed)
                 node[last_axis] += 1
 
     @ti.func
-    def each_in_pencils(self, at: ti.template()):
-        """Apply the function of a phase to particles that add to nodes, pencil by pencil."""
-        self.in_pencils(at, at.item, self.time_of(at), False)
+    def each_particle(self, at: ti.template()):
+        """Apply the function of a phase to particles, pencil by pencil if it adds to nodes."""
+        (op,) = ti.static((at.phase.body,))
+        if self.takes_place(at):
+            how, gravity_step = self.time_of(at), self.gravity_of(at.step)
+            (inner,) = ti.static((changed(at, gravity_step=gravity_step),))
+            if ti.static(at.phase.adds):
+                self.in_pencils(inner, op, how)
+            else:
+                found = NOTHING
+                if ti.static(in_window(op, at.grid)):
+                    first, after = self.places.pencils_of(at)
+                    found = over_tiles(inner, op, at.order.first_tile_of(first), at.order.first_tile_of(after), how)
+                else:
+                    first, after = self.places.particles_of(at)
+                    found = over(inner, op, first, after, how)
+                if ti.static(len(at.phase.most) > 0):
+                    (kept,) = ti.static((getattr(at.step, at.phase.most),))
+                    ti.atomic_max(kept[at.g], found)
 
     @ti.func
-    def in_pencils(self, at: ti.template(), op: ti.template(), how: float, by_tiles: ti.template()):
-        """Carry out an operation that adds to nodes, pencil by pencil, or `by_tiles` in the window of the thread."""
+    def in_pencils(self, at: ti.template(), op: ti.template(), how: float):
+        """Carry out an operation that adds to nodes, pencil by pencil."""
         first, after = 0, 0
         if at.turn < self.colours:
             first, after = self.pencils(at.order, at.turn, at.region, at.part)
             for r in range(first, after):
                 pencil = at.order.pencil_of(at.turn, r)
-                if ti.static(by_tiles):
+                if ti.static(in_window(op, at.grid)):
                     add_over_tiles(at, op, at.order.first_tile_of(pencil), at.order.first_tile_of(pencil + 1), how)
                 else:
                     begin, end = at.order.first_particle_of(pencil), at.order.first_particle_of(pencil + 1)
@@ -417,12 +429,6 @@ class CpuPhases(RunPhases):
             if at.turn == self.colours and at.region == 0 and at.part == 0:
                 first, after = self.come_in(at.g, at.order, at.run)
                 over(at, op, first, after, how)
-
-    @ti.func
-    def each_particle(self, at: ti.template()):
-        """Apply the function of a phase to particles."""
-        first, after = self.places.particles_of(at)
-        over(at, at.item, first, after, self.time_of(at))
 
     @ti.func
     def clear(self, at: ti.template()):
@@ -455,33 +461,6 @@ class CpuPhases(RunPhases):
         return first, run.w * ti.static(self.device.capacity[g]) + run.particles[g]
 
     @ti.func
-    def average(self, at: ti.template()):
-        """Add particles of the g-th group to the averages of their cells; groups that level need them in some steps."""
-        needed = at.step.relaxed > 0.0
-        if ti.static(at.group.uses_f_bar):
-            needed = True
-        if needed:
-            self.in_pencils(at, AVERAGE, at.step.dt, False)
-
-    @ti.func
-    def scatter(self, at: ti.template()):
-        """Scatter particles of the g-th group."""
-        (inner, op) = ti.static((changed(at, sums=None), self.device.scatters[at.g]))
-        self.in_pencils(inner, op, at.step.kick, at.grid.sparse)
-
-    @ti.func
-    def relax(self, at: ti.template()):
-        """Relax the volumes of particles of the g-th group, in steps that relax volumes."""
-        relaxed = at.step.relaxed
-        if relaxed > 0.0:
-            first, after = self.places.particles_of(at)
-            change = 0.0
-            for p in range(first, after):
-                stay_rolled(at.order.buffers.real, p)
-                change = ti.max(change, at.particles.relax(at.g, self.device.groups[at.g], p, relaxed))
-            ti.atomic_max(at.step.volume_change[at.g], change)
-
-    @ti.func
     def find_contact(self, at: ti.template()):
         """Find where material presses on separating walls."""
         self.each_plane_node(at, False)
@@ -503,7 +482,7 @@ class CpuPhases(RunPhases):
         for layer in range(layers):
             own = self.used_by(at, layer)
             (inner,) = ti.static((at.in_layer(layer, own),))
-            (grid,) = ti.static((inner.grid.within(own) if at.grid.layers > 1 else at.grid,))
+            (grid,) = ti.static((inner.grid.within(own),))
             first, after = self.places.part_of(at, inner.nodes.images.plane_nodes(grid))
             for q in range(first, after):
                 if ti.static(rubs):
@@ -527,19 +506,6 @@ class CpuPhases(RunPhases):
                 (inner,) = ti.static((at.in_layer(layer, own),))
                 speed_squared = ti.max(speed_squared, update_rows(inner, first, after, self.gravity_of(at.step)))
         ti.atomic_max(at.step.speed_squared, speed_squared)
-
-    @ti.func
-    def advance(self, at: ti.template()):
-        """Gather and move particles of the g-th group."""
-        dt, gravity_step, rate = at.step.dt, self.gravity_of(at.step), NOTHING
-        (inner, op) = ti.static((changed(at, gravity_step=gravity_step), self.device.advances[at.g]))
-        if ti.static(at.grid.sparse):
-            first, after = self.places.pencils_of(at)
-            rate = over_tiles(inner, op, at.order.first_tile_of(first), at.order.first_tile_of(after), dt)
-        else:
-            first, after = self.places.particles_of(at)
-            rate = over(inner, op, first, after, dt)
-        ti.atomic_max(at.step.rate[at.g], rate)
 
     # Sorts and frames.
 
@@ -588,19 +554,13 @@ class CpuPhases(RunPhases):
             first, after = self.places.part_of(at, at.run.capacity[at.g])
             first += at.w * ti.static(self.device.capacity[at.g])
             after += at.w * ti.static(self.device.capacity[at.g])
-        scratch, capacity = ti.static((self.device.orders[at.g].buffers, self.device.capacity[at.g]))
-        offset = scratch_offset(scratch, at.g, at.w, capacity)
-        write_range(
-            at.group,
-            first,
-            after - first,
-            ti.cast(at.run.last_step, float),
-            at.run.row,
-            at.run.affine,
-            at.run.gradient,
-            at.run.tau,
-            at.run.activity,
-            at.frame_buffer,
-            scratch.real,
-            offset,
+        (run, scratch) = ti.static((at.run, self.device.orders[at.g].buffers))
+        offset = scratch_offset(scratch, at.g, at.w, ti.static(self.device.capacity[at.g]))
+        row, affine, gradient, tau, activity = run.row, run.affine, run.gradient, run.tau, run.activity
+        dt = ti.cast(run.last_step, float)
+        (rows,) = ti.static(
+            (FrameRows(at.frame_buffer, row, affine, gradient, tau, activity, dt, scratch.real, offset),)
         )
+        (inner, op) = ti.static((changed(at, rows=rows), self.device.shows[at.g]))
+        for turn in range(turns(at.group, rows)):
+            over(inner, op, first, after, ti.cast(turn, float))

@@ -1,6 +1,6 @@
 """The data of a batch on the device, and the view of one run in a kernel."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,15 +14,14 @@ from mpmcli.solver.drive.forces import DriveValues, Gravity
 from mpmcli.solver.engine.run_state import Layout, RunState, StepState
 from mpmcli.solver.engine.step import step_phases
 from mpmcli.solver.features import Features
+from mpmcli.solver.frames.reader import show_of
 from mpmcli.solver.grid.grid import Grid
 from mpmcli.solver.particles.arrays import ParticleArrays
 from mpmcli.solver.particles.loop import Operation
 from mpmcli.solver.particles.sort import TileOrder
 from mpmcli.solver.particles.state_bounds import NOTHING
-from mpmcli.solver.transfer.advance import advance_of
 from mpmcli.solver.transfer.node_update import NodeUpdate
 from mpmcli.solver.transfer.particle_update import NOT_LOST, ParticleUpdate
-from mpmcli.solver.transfer.scatter import scatter_of
 from mpmcli.solver.transfer.splines import PAD
 
 
@@ -68,21 +67,15 @@ class Device:
         return self.groups[0].particle_count_varies
 
     @cached_property
-    def scatters(self) -> tuple[Operation, ...]:
-        """P2G of each law."""
-        how = {"keeps": self.grid.scheme.keeps_flip_velocity, "repels": self.particles.repels}
-        return tuple(scatter_of(group, **how) for group in self.groups)
+    def shows(self) -> tuple[Operation, ...]:
+        """What writes the particles of each law to a frame."""
+        return tuple(map(show_of, self.groups))
 
     @cached_property
-    def advances(self) -> tuple[Operation, ...]:
-        """G2P of each law."""
-        return tuple(advance_of(group, keeps=self.grid.scheme.keeps_flip_velocity) for group in self.groups)
-
-    @property
     def phases(self) -> tuple[Phase, ...]:
         """The phases of a step."""
         pressed, serial = self.features.surfaces is None or self.features.surfaces.shares, self.stencils is not None
-        return step_phases(self.groups, self.nodes, self.features, pressed=pressed, serial=serial)
+        return step_phases(self.groups, self.nodes, self.particles, self.features, pressed=pressed, serial=serial)
 
 
 class RunView:
@@ -164,17 +157,20 @@ class Work:
     Attributes:
         run, step, grid, nodes, particles, features: see `RunView`.
         order, group: tile order and fields of the group of particles.
-        item: function for each node or particle.
+        phase: the phase, None outside of a step.
         g: index of the group.
         w: index of the run.
         turn: turn of the phase.
+        sums: None, or the `RunSums` of the thread.
     """
 
-    def __init__(self, view: RunView, g: int, item: Callable | None, turn: object) -> None:
+    sums = None
+
+    def __init__(self, view: RunView, g: int, phase: Phase | None, turn: object) -> None:
         self.run, self.step, self.w = view.run, view.step, view.w
         self.grid, self.nodes, self.particles, self.features = view.grid, view.nodes, view.particles, view.features
         self.g, self.group, self.order = g, view.groups[g], view.orders[g] if view.orders else None
-        self.item, self.turn = item, turn
+        self.phase, self.turn = phase, turn
 
     def in_layer(self, layer: object, own: object) -> "Work":
         """Return the work for a layer of nodes, given its number and its box in use, variables of a kernel."""
@@ -249,8 +245,7 @@ class RunPhases:
         """Return the box in use of a layer, as in `Grid.box`."""
         own = ti.Matrix.zero(int, 2, self.dimension)
         if ti.static(self.separates):
-            for i, a in ti.static(ti.ndrange(2, self.dimension)):
-                own[i, a] = self.device.features.surfaces.used[(at.w * ti.static(at.grid.layers) + layer) * 2 + i, a]
+            own = self.device.features.surfaces.used_by(at.w, layer)
         return own
 
     @ti.func
@@ -296,11 +291,17 @@ class RunPhases:
 
     @ti.func
     def time_of(self, at: ti.template()):
-        """Return the time that an operation on particles covers, s: the step, or in a shift that since the last one."""
-        time = at.step.dt
-        if ti.static(at.shifts):
-            time = at.step.relaxed
+        """Return the number of the step that the body of a phase takes, s."""
+        (time,) = ti.static((getattr(at.step, at.phase.duration),))
         return time
+
+    @ti.func
+    def takes_place(self, at: ti.template()):
+        """Return whether the step carries out a phase."""
+        result = True
+        if ti.static(at.phase.relaxes or at.phase.shifts):
+            result = at.step.relaxed > 0.0
+        return result
 
     @ti.func
     def gravity_of(self, step: ti.template()):

@@ -83,7 +83,7 @@ class CpuEmission:
             self.stencils[w * 2 + 1, a] = ti.max(self.stencils[w * 2 + 1, a], base[a])
         if ti.static(self.separates):
             # Emitted particles are in layer 0.
-            self.device.features.surfaces.widen(w * ti.static(self.device.grid.layers), base)
+            self.device.features.surfaces.widen(w, 0, base)
 
     @ti.func
     def is_left(self, e: ti.template(), run: ti.template()):

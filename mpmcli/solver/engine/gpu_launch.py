@@ -21,10 +21,9 @@ from mpmcli.solver.drive.forces import HostValues
 from mpmcli.solver.engine.device import Device, RunPhases, RunView, Work
 from mpmcli.solver.engine.emission import GpuEmission
 from mpmcli.solver.engine.run_state import ATTEND, GOING, MEASURE, Layout, RunState
-from mpmcli.solver.engine.step import sorted_fields
 from mpmcli.solver.engine.step_size import SLACK, StepSize
 from mpmcli.solver.frames.columns import FrameColumns
-from mpmcli.solver.frames.reader import chosen_columns, write_range
+from mpmcli.solver.frames.reader import FrameRows, Showing, chosen_columns, turns
 from mpmcli.solver.grid.grid import box_of
 from mpmcli.solver.machine.backend import launcher
 from mpmcli.solver.machine.maxima import Maxima
@@ -39,7 +38,6 @@ from mpmcli.solver.particles.state_bounds import (
     widen_state,
 )
 from mpmcli.solver.transfer.cpu_transfers import nodes_of_rows
-from mpmcli.solver.transfer.lanes import LANES
 from mpmcli.solver.transfer.particle_update import NOT_LOST
 from mpmcli.solver.transfer.run_sums import (
     WARP,
@@ -55,6 +53,9 @@ from mpmcli.solver.transfer.splines import PAD
 from mpmcli.solver.transfer.volume import AVERAGE, clear_mean, missing_to_mean
 from mpmcli.stability.transfer_factors import INTERVAL
 
+# Numbers of a step that keep the largest value of an operation, see `Phase.most`.
+PEAKS = ("rate", "volume_change")
+
 
 class Item(Work):
     """The item q of a thread: a node, a particle or a row of nodes.
@@ -64,12 +65,12 @@ class Item(Work):
         peaks: extremes of the step, see `GpuPhases`.
     """
 
-    atomic, wanted = True, None
+    atomic = True
 
     def __init__(self, view: RunView, phase: Phase, turn: int, q: object, peaks: Maxima) -> None:
         """Store a view and a variable of a kernel."""
-        super().__init__(view, phase.group, phase.body, turn)
-        self.q, self.peaks, self.shifts = q, peaks, phase.shifts
+        super().__init__(view, phase.group, phase, turn)
+        self.q, self.peaks = q, peaks
 
 
 @ti.data_oriented
@@ -101,8 +102,9 @@ class GpuPhases(RunPhases):
         (step,) = ti.static((self.step_of(w),))
         step.speed_squared = ti.max(step.speed_squared, self.peaks.value(w, 0))
         for g in ti.static(range(len(self.members))):
-            step.rate[g] = ti.max(step.rate[g], self.peaks.value(w, 1 + 2 * g))
-            step.volume_change[g] = ti.max(step.volume_change[g], self.peaks.value(w, 2 + 2 * g))
+            for k, name in ti.static(enumerate(PEAKS)):
+                (kept,) = ti.static((getattr(step, name),))
+                kept[g] = ti.max(kept[g], self.peaks.value(w, 1 + k + 2 * g))
 
     def run(self, w: object) -> RunState:
         """Return the numbers of a run."""
@@ -157,22 +159,23 @@ class GpuPhases(RunPhases):
     @ti.func
     def do_item(self, at: ti.template(), node: ti.template()):
         """Apply the function of a phase to a node of a layer."""
-        ti.static(at.item)(at, node, at.step.kick)
+        ti.static(at.phase.body)(at, node, at.step.kick)
 
     @ti.func
     def shift_node(self, at: ti.template()):
         """Apply the function of a phase to a node in steps that shift particles."""
         if at.step.relaxed > 0.0 and at.q < at.grid.box_nodes():
-            ti.static(at.item)(at, at.grid.box_node(at.q), at.step.relaxed)
+            ti.static(at.phase.body)(at, at.grid.box_node(at.q), at.step.relaxed)
 
     @ti.func
     def each_particle(self, at: ti.template()):
-        """Apply the function of a phase to a particle, if it belongs to a shift in steps that shift particles."""
-        if ti.static(at.shifts):
-            if at.step.relaxed > 0.0:
-                one(at, at.item, at.q, at.step.relaxed)
-        else:
-            one(at, at.item, at.q, at.step.dt)
+        """Apply the function of a phase to a particle."""
+        if self.takes_place(at):
+            gravity_step = self.gravity_of(at.step)
+            (inner,) = ti.static((changed(at, gravity_step=gravity_step),))
+            found = one(inner, at.phase.body, at.q, self.time_of(at))
+            if ti.static(len(at.phase.most) > 0):
+                self.peaks.include(at.w, ti.static(1 + PEAKS.index(at.phase.most)) + 2 * at.g, found)
 
     @ti.func
     def clear(self, at: ti.template()):
@@ -181,7 +184,7 @@ class GpuPhases(RunPhases):
             node = at.grid.box_node(at.q)
             self.in_layers(at, node, self.clear_node)
             if ti.static(self.separates):
-                place = self.device.features.surfaces.place_of(at.grid, at.w, at.grid.linear_index(node))
+                place = self.device.features.surfaces.index_in_batch(at.grid, at.w, at.grid.linear_index(node))
                 self.device.features.surfaces.clear(place)
 
     @ti.func
@@ -190,22 +193,7 @@ class GpuPhases(RunPhases):
         at.grid.clear(at.grid.linear_index(node))
 
     @ti.func
-    def average(self, at: ti.template()):
-        """Add a particle to the sums of its cell, in steps that need them."""
-        needed = at.step.relaxed > 0.0
-        if ti.static(at.group.uses_f_bar):
-            needed = True
-        if needed:
-            one(at, AVERAGE, at.q, at.step.dt)
-
-    @ti.func
-    def scatter(self, at: ti.template()):
-        """Scatter a particle."""
-        (own,) = ti.static((changed(at, sums=None),))
-        one(own, self.device.scatters[at.g], at.q, at.step.kick)
-
-    @ti.func
-    def scatter_run(self, g: ti.template(), w: int, thread: int, length: ti.template()):
+    def scatter_run(self, phase: ti.template(), w: int, thread: int, length: ti.template()):
         """Scatter the particles of a thread of a run, see `run_sums`."""
         (run,) = ti.static((self.run(w),))
         (view,) = ti.static(self.see(run))
@@ -213,11 +201,10 @@ class GpuPhases(RunPhases):
         (own,) = ti.static((RunSums(self.device.grid, sums, stencil),))
         p = thread // WARP * (WARP * length) + thread % WARP
         for _ in range(length):
-            if p < run.particles[g]:
-                place = w * ti.static(self.device.capacity[g]) + p
-                (at,) = ti.static((Item(view, Phase("scatter", "particles", "scatter", g), 0, place, self.peaks),))
-                (inner,) = ti.static((changed(at, sums=own),))
-                one(inner, self.device.scatters[g], place, at.step.kick)
+            if p < run.particles[phase.group]:
+                place = w * ti.static(self.device.capacity[phase.group]) + p
+                (at,) = ti.static((changed(Item(view, phase, 0, place, self.peaks), sums=own),))
+                one(at, phase.body, place, at.step.kick)
             p += WARP
         flush(own)
 
@@ -234,13 +221,6 @@ class GpuPhases(RunPhases):
         return step.relaxed > 0.0
 
     @ti.func
-    def relax(self, at: ti.template()):
-        """Relax the volume of a particle in steps that relax volumes."""
-        if at.step.relaxed > 0.0:
-            change = at.particles.relax(at.g, self.device.groups[at.g], at.q, at.step.relaxed)
-            self.peaks.include(at.w, 2 + 2 * at.g, change)
-
-    @ti.func
     def find_contact(self, at: ti.template()):
         """Find whether material presses on a separating wall at a node."""
         if at.q < at.nodes.images.plane_nodes(at.grid):
@@ -252,7 +232,7 @@ class GpuPhases(RunPhases):
         for layer in range(self.layer_count(at)):
             own = self.used_by(at, layer)
             (inner,) = ti.static((at.in_layer(layer, own),))
-            (grid,) = ti.static((inner.grid.within(own) if at.grid.layers > 1 else at.grid,))
+            (grid,) = ti.static((inner.grid.within(own),))
             if at.q < inner.nodes.images.plane_nodes(grid):
                 find_friction(inner.nodes.images, grid, at.q, self.gravity_of(at.step))
 
@@ -274,14 +254,6 @@ class GpuPhases(RunPhases):
         at.nodes.colliders.add_row(at.q)
         if ti.static(at.nodes.touches):
             at.features.points.add_row(at.grid, at.q)
-
-    @ti.func
-    def advance(self, at: ti.template()):
-        """Gather and move a particle."""
-        gravity_step = self.gravity_of(at.step)
-        (own,) = ti.static((changed(at, gravity_step=gravity_step),))
-        rate = one(own, self.device.advances[at.g], at.q, at.step.dt)
-        self.peaks.include(at.w, 1 + 2 * at.g, rate)
 
     # Work outside of steps.
 
@@ -312,11 +284,6 @@ class GpuPhases(RunPhases):
         (run,) = ti.static((self.run(w),))
         (view,) = ti.static(self.see(run))
         return view.orders[g].first_node_of(p)
-
-    @ti.func
-    def layer_of(self, g: ti.template(), w: int, p: int):
-        """Return the layer of a particle, counted over all runs."""
-        return w * ti.static(self.device.grid.layers) + self.device.groups[g].layer_of(p)
 
     @ti.func
     def nodes_in_use(self, w: int):
@@ -364,6 +331,7 @@ class GpuLaunch:
     """
 
     def __init__(self, device: Device, layout: Layout, *, doubles: bool) -> None:
+        """Divide the phases of a step among launches; kernels are compiled when they are called."""
         self.device, self.layout, self.doubles = device, layout, doubles
         self.dimension, self.runs, groups = device.grid.dimension, device.runs, device.groups
         self.capacity, self.members = tuple(device.capacity), tuple(enumerate(groups))
@@ -380,7 +348,7 @@ class GpuLaunch:
         self.relaxing = [phase for phase in phases if phase.name == "relax" and pressed]
         self.parts[FIRST] = [one for one in self.parts[FIRST] if one[0] not in self.relaxing]
         self.steps = StepSize.of(device, layout, device.values if doubles else HostValues(device.values))
-        self.sorts, self.moved = device.sorts, sorted_fields(groups)
+        self.sorts, self.moved = device.sorts, tuple(group.moved for group in groups)
         self.by_runs = device.sorts and scatters_runs(device.grid)
         self.averages = any(group.uses_f_bar for group in groups)
         loads = device.features.colliders and device.features.colliders.loads
@@ -530,7 +498,7 @@ class GpuLaunch:
                         self.phases.do(self.clear, 0, q // self.reach[0], q % self.reach[0])
                         q += ti.static(self.turn_threads - self.runs)
         for phase, turn in ti.static(self.parts[part]):
-            if ti.static(phase.over != "particles" or phase.name == "relax"):
+            if ti.static(phase.over != "particles" or phase.relaxes):
                 # A loop over all items would need a kernel that computes their number.
                 for t in range(self.step_threads):
                     if ti.static(phase.name == "find_contact"):
@@ -543,7 +511,7 @@ class GpuLaunch:
                     w = q // threads
                     if self.stepping[w] == 1:
                         length = ti.static(run_length(self.capacity[phase.group]))
-                        self.phases.scatter_run(phase.group, w, q % threads, length)
+                        self.phases.scatter_run(phase, w, q % threads, length)
             elif ti.static(phase.over == "particles"):
                 for p in range(self.runs * self.capacity[phase.group]):
                     w = p // self.capacity[phase.group]
@@ -742,13 +710,8 @@ class GpuLaunch:
             for p in range(self.runs * room):
                 w = p // room
                 if self.is_sorted(g, w, p):
-                    keep(
-                        buffers,
-                        field,
-                        w * buffers.capacity,
-                        p - w * room,
-                        buffers.order[w * buffers.capacity + p - w * room],
-                    )
+                    own, q = w * buffers.capacity, p - w * room
+                    keep(buffers, field, own, q, buffers.order[own + q])
             for p in range(self.runs * room):
                 w = p // room
                 if self.is_sorted(g, w, p):
@@ -778,7 +741,7 @@ class GpuLaunch:
                     if self.sorting[w] == 1 and self.takes_part(g, w, p):
                         base = self.phases.first_node_of(g, w, p)
                         if ti.static(self.phases.separates):
-                            self.device.features.surfaces.widen(self.phases.layer_of(g, w, p), base)
+                            self.device.features.surfaces.widen(w, self.device.groups[g].layer_of(p), base)
                         for a in ti.static(range(self.dimension)):
                             # The comparisons may use old values; they avoid most atomic operations.
                             if base[a] < self.stencils[2 * w, a]:
@@ -845,10 +808,12 @@ class GpuLaunch:
             activity: int,
             frame_buffer: ti.types.ndarray(ndim=2),
         ):
-            for chunk in range((count + LANES - 1) // LANES):
-                begin, own = first + chunk * LANES, ti.min(LANES, count - chunk * LANES)
-                (seen,) = ti.static((group.seen_from(run),))
-                write_range(seen, begin, own, dt, 0, affine, gradient, tau, activity, frame_buffer, None, 0)
+            """Write the `FrameColumns` of particles from `first` on."""
+            for q in range(count):
+                (rows,) = ti.static((FrameRows(frame_buffer, 0, affine, gradient, tau, activity, dt),))
+                (at, op) = ti.static((Showing(self.device.grid, group.seen_from(run), rows), self.device.shows[g]))
+                for turn in range(turns(group, rows)):
+                    one(at, op, first + q, ti.cast(turn, float))
 
         return write_frame
 

@@ -93,6 +93,7 @@ class StoredLaunch:
     def _first(
         self, numbers: np.ndarray, counts: np.ndarray, frame_buffer: np.ndarray, frame_stats: np.ndarray
     ) -> None:
+        """Launch for the first time: the stored kernel, or the compiled one, which is stored when Taichi stops."""
         name = "launch"
         if self._may_store():
             facts = (self._kind, self._backend, self._launch.device.runs)

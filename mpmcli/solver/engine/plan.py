@@ -117,7 +117,7 @@ def make_plan(scene: Scene | Resolved, backend: Backend) -> Plan:
 
 def _fields_by_node(grid: Grid) -> list[DryField]:
     """Return the fields with an entry for each node, or for each fine node."""
-    sums = [] if grid.fixed is None else [*grid.fixed.kept, *([grid.fixed.fine] if grid.fixed.fine else [])]
+    sums = [] if grid.fixed is None else [*grid.fixed.kept, *([grid.fine.sums] if grid.fine else [])]
     found = [grid.nodes, grid.filling, *grid.means, *([grid.fine.fill] if grid.fine else [])]
     found += [field for each in sums for field in (each.high, each.low)]
     return [field for field in found if field is not None]

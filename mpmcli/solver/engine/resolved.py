@@ -37,8 +37,10 @@ class Resolved:
         """The kind of its runs: with its particles, or as many as `count_sources` finds."""
         scene, found = self.scene, self.particles
         if found is None:
-            return CompiledKind.of(scene, self.layers, count_sources(scene, self._places), sheets_in(scene))
-        return CompiledKind.of(scene, self.layers, [b.count for b in found], [b.sheets for b in found if b.waits])
+            counts, sheets = count_sources(scene, self._places), sheets_in(scene)
+        else:
+            counts, sheets = [b.count for b in found], [b.sheets for b in found if b.waits]
+        return CompiledKind.of(scene, self.layers, counts, sheets)
 
     def sampled(self) -> "Resolved":
         """Return it with its particles; InputError: see `sample_bodies`."""

@@ -6,7 +6,6 @@ import numpy as np
 
 from mpmcli.errors import InputError
 from mpmcli.materials.law import Law
-from mpmcli.quick_taichi import ti
 from mpmcli.scene import BodyParticles, Scene
 from mpmcli.solver.contact.layers import Layers
 from mpmcli.solver.contact.surfaces import rest_surface
@@ -63,7 +62,9 @@ def initial_states(
                 "internal": np.stack([values[own] for values in internal], axis=1) if internal else np.empty((n, 0)),
                 "id": first_id + np.arange(first, own.stop),
                 "activity": 0 if body.waits else 1,
-                "surface": surface[own],
+                "carried": surface[own],
+                # A particle that waits enters beside few others.
+                "borne": 1 / law.relief if body.waits else 1.0,
             }
             yield before + first, found, np.full(n, place)
         before += count
@@ -109,34 +110,17 @@ class RunGroup:
 
         `Run.state_was_replaced` or `Run.restart` must follow.
         """
-        arrays, d = self.arrays, self.dimension
-        if "x" in state:
-            self._assign(arrays.x, np.asarray(state["x"]))
-        if "v" in state:
-            self._assign(arrays.v, np.asarray(state["v"]))
         if "C" in state:
-            # The remainders of positions are reset.
-            gradient = np.zeros((self.count, d, arrays.gradient.m))
-            gradient[:, :, :d] = np.asarray(state["C"]).transpose(0, 2, 1)
-            self._assign(arrays.gradient, gradient)
+            state["remainder"] = 0
         if "deformation" in state:
-            deformation = np.asarray(state["deformation"])
-            if arrays.displacement_gradient is None:
-                self._assign(arrays.J_minus_1, deformation - 1)
-            else:
-                self._assign(arrays.displacement_gradient, deformation - np.eye(d))
-            if arrays.evened:
-                self._assign(arrays.growth, np.zeros(self.count))
-        for i, field in enumerate(arrays.internal if "internal" in state else ()):
-            self._assign(field, np.asarray(state["internal"])[:, i])
-        if "id" in state:
-            self._assign(arrays.id, np.asarray(state["id"]))
-
-    def _assign(self, field: ti.Field, values: np.ndarray) -> None:
-        """Set the entries of the group in a field."""
-        whole = field.to_numpy()
-        whole[self.first : self.first + self.count] = values
-        field.from_numpy(whole)
+            state |= {"deformation": state["deformation"] - self.arrays.rest, "growth": 0}
+        for name, values in state.items():
+            column = self.arrays.column(name)
+            numbers = np.broadcast_to(values, (self.count, *column.shape)).reshape(self.count, -1)
+            for (field, place), own in zip(column.entries, numbers.T, strict=False):
+                whole = field.to_numpy()
+                whole[(slice(self.first, self.first + self.count), *place)] = own
+                field.from_numpy(whole)
 
     def fill(self, states: Iterable[tuple[int, Mapping[str, np.ndarray], np.ndarray]], layers: Layers) -> None:
         """Write particles (see `initial_states`), the table and the layers of bodies to the device."""

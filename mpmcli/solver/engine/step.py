@@ -18,51 +18,79 @@ a node or a particle, that of `CpuPhases` a part of all items.
 from collections.abc import Iterable, Sequence
 
 from mpmcli.boundaries.feature import STAGES, Feature, Phase
-from mpmcli.quick_taichi import ti
 from mpmcli.solver.grid.grid import Grid
 from mpmcli.solver.particles.arrays import ParticleArrays
 from mpmcli.solver.transfer import redistribution as by
+from mpmcli.solver.transfer.advance import advance_of
 from mpmcli.solver.transfer.easing import ease_phases
 from mpmcli.solver.transfer.node_update import NodeUpdate
+from mpmcli.solver.transfer.particle_update import ParticleUpdate
+from mpmcli.solver.transfer.scatter import scatter_of
+from mpmcli.solver.transfer.volume import AVERAGE, RELAX
 
 
 def step_phases(
-    arrays: Sequence[ParticleArrays], nodes: NodeUpdate, features: Iterable[Feature], *, pressed: bool, serial: bool
+    arrays: Sequence[ParticleArrays],
+    nodes: NodeUpdate,
+    particles: ParticleUpdate,
+    features: Iterable[Feature],
+    *,
+    pressed: bool,
+    serial: bool,
 ) -> tuple[Phase, ...]:
     """Return the phases of a step; consecutive ones with the same name that do not add to nodes may run concurrently.
 
     Args:
         arrays: the particles of each law.
-        nodes: the update of nodes.
+        nodes, particles: the updates of nodes and of particles.
         features: the features of the runs, whose phases follow those of the engine in each stage.
         pressed: whether walls find what presses on them at nodes.
         serial: see `Feature.phases`.
     """
-    groups, grid = tuple(enumerate(arrays)), nodes.grid
-    scatter = "scatter {} with forces", "scatter {}"
-    update = "update grid with colliders" if nodes.collides else "update grid"
+    grid, groups = nodes.grid, tuple(enumerate(arrays))
+    keeps, update = grid.scheme.keeps_flip_velocity, "update grid with colliders" if nodes.collides else "update grid"
     own = (
         *(shift_phases(arrays, grid) if grid.fine else ()),
         *(ease_phases(arrays, grid) if any(group.eased for group in arrays) else ()),
+        *scatter_phases(arrays, grid, repels=particles.repels),
+        *[Phase("find_contact", "planes", "walls", words="find contact")] * (pressed and nodes.needs_contact),
+        *[Phase("find_friction", "planes", "walls", words="find friction")] * nodes.needs_friction,
+        Phase("update", "nodes", "update", words=update),
+        *(
+            Phase(
+                "advance", "particles", "gather", g, body=advance_of(group, keeps=keeps), most="rate", words="gather {}"
+            )
+            for g, group in groups
+        ),
+    )
+    more = (phase for feature in features for phase in feature.phases(serial=serial))
+    return tuple(sorted((*own, *more), key=lambda phase: STAGES.index(phase.stage)))
+
+
+def scatter_phases(arrays: Sequence[ParticleArrays], grid: Grid, *, repels: bool) -> tuple[Phase, ...]:
+    """Return the phases of P2G, and those that relax volumes by its sums."""
+    groups, keeps = tuple(enumerate(arrays)), grid.scheme.keeps_flip_velocity
+    adds = {"over": "particles", "stage": "scatter", "adds": True}
+    forces = "scatter {}", "scatter {} with forces"
+    return (
         Phase("clear", "nodes", "scatter", words="clear grid"),
         *(
-            Phase("average", "particles", "scatter", g, adds=True, words="average volumes of {}")
+            Phase("average", group=g, body=AVERAGE, relaxes=not group.uses_f_bar, words="average volumes of {}", **adds)
             for g, group in groups
             if group.averages
         ),
         *(
-            Phase("scatter", "particles", "scatter", g, adds=True, words=scatter[not group.has_body_force])
+            Phase("scatter", group=g, body=body, time="kick", words=forces[group.has_body_force], **adds)
             for g, group in groups
+            for body in (scatter_of(group, keeps=keeps, repels=repels),)
         ),
         *[Phase("to_float", "nodes", "scatter", words="read sums in fixed point")] * grid.deterministic,
-        *(Phase("relax", "particles", "relax", g) for g, group in groups if group.law.relaxes or group.levels),
-        *[Phase("find_contact", "planes", "walls", words="find contact")] * (pressed and nodes.needs_contact),
-        *[Phase("find_friction", "planes", "walls", words="find friction")] * nodes.needs_friction,
-        Phase("update", "nodes", "update", words=update),
-        *(Phase("advance", "particles", "gather", g, words="gather {}") for g, _ in groups),
+        *(
+            Phase("relax", "particles", "relax", g, body=RELAX, time="relaxed", relaxes=True, most="volume_change")
+            for g, group in groups
+            if group.law.relaxes or group.levels
+        ),
     )
-    more = (phase for feature in features for phase in feature.phases(serial=serial))
-    return tuple(sorted((*own, *more), key=lambda phase: STAGES.index(phase.stage)))
 
 
 def shift_phases(arrays: Sequence[ParticleArrays], grid: Grid) -> tuple[Phase, ...]:
@@ -80,8 +108,3 @@ def shift_phases(arrays: Sequence[ParticleArrays], grid: Grid) -> tuple[Phase, .
         Phase("fold_shift", "nodes", "shift", **folds, body=by.fold_shift),
         *(Phase("unshift", "particles", "shift", g, body=by.UNSHIFT) for g in flowing),
     )
-
-
-def sorted_fields(groups: Sequence) -> tuple[tuple[ti.Field, ...], ...]:
-    """Return the fields of each group that the sort moves."""
-    return tuple((*group.state, *group.labels) for group in groups)

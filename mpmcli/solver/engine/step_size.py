@@ -29,11 +29,11 @@ from mpmcli.stability.transfer_factors import INTERVAL, step_inertia
 COLLIDER, DEFORMING, FORCE, FORCED, MAXIMUM, CROSSING = (
     LIMITS.index(name) for name in ("collider", "deformation", "force", "forced", "maximum", "speed")
 )
-# A bound falls immediately. It rises only to the smallest bound of the last HOLD to 2 HOLD steps, and only if that
-# exceeds it by the factor RISE. A step that follows the oscillation of a particle, always smaller in the same phase,
-# would amplify the oscillation. Lone neo-Hookean particles released at strains of 5 to 40 % gained up to 27 times their
-# energy in 10,000 steps when the bound rose by a thousandth per step, and up to 4 times with this rule.
-HOLD, RISE = 128, 1.05
+# A bound falls immediately. It rises only to the smallest bound of the last steps, HOLD_STEPS to twice as many, and
+# only if that exceeds it by the factor RISE. A step that follows the oscillation of a particle, always smaller in the
+# same phase, would amplify the oscillation. Lone neo-Hookean particles released at strains of 5 to 40 % gained up to 27
+# times their energy in 10,000 steps when the bound rose by a thousandth per step, and up to 4 times with this rule.
+HOLD_STEPS, RISE = 128, 1.05
 # Ratio of the stable step to the first one below which a run stops, because such small steps do not recover.
 COLLAPSE = 1e-4
 # Fraction of a step by which the time to a target may exceed an integer number of steps.
@@ -251,10 +251,10 @@ class StepSize:
 
     @ti.pyfunc
     def limit_rise(self, run: ti.template(), bound: ti.f64):
-        """Lower the held bound to a bound immediately, or raise it with a delay, see HOLD."""
+        """Lower the held bound to a bound immediately, or raise it with a delay, see HOLD_STEPS."""
         low, held = ti.min(run.low, bound), ti.min(run.held, bound)
         steps = run.held_steps + 1
-        if steps >= HOLD:
+        if steps >= HOLD_STEPS:
             lowest = ti.min(run.low_before, low)
             if lowest > as_double(RISE) * held:
                 held = lowest

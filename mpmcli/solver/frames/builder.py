@@ -357,7 +357,23 @@ class FrameBuilder:
         conserved |= totals.entries(constants.masses, [one.passed(times) for one in self._sheets])
         if status is not None:
             conserved["blocked"] = np.array([moment.blocked for moment in moments])
-        durations, self.before = np.diff([self.before, *times]), times[-1]
+        self._add_loads(moments, conserved, gravity, last_steps)
+        return list(zip(frames, ledger_rows(conserved, times, taken), strict=True))
+
+    def _add_loads(
+        self,
+        moments: Sequence[Moment],
+        conserved: dict[str, np.ndarray],
+        gravity: np.ndarray,
+        last_steps: np.ndarray,
+    ) -> None:
+        """Add loads and rigid bodies at T moments to the entries of their `LedgerRow`s, by name.
+
+        `gravity` is gravity, m/s^2, (T, d), `last_steps` the last step before each moment, s.
+        """
+        scene, d = self._scene, self._scene.dimension
+        durations = np.diff([self.before, *(moment.time for moment in moments)])
+        self.before = moments[-1].time
         for name in moments[0].loads:
             found = np.array([moment.loads[name] for moment in moments])
             if found.ndim == 1:
@@ -377,7 +393,6 @@ class FrameBuilder:
                 spans = durations[:, None, None]
                 found = np.divide(found, spans, where=spans > 0, out=np.zeros_like(found))
                 conserved[f"{name}_force"], conserved[f"{name}_torque"] = found[..., :d], found[..., d:]
-        return list(zip(frames, ledger_rows(conserved, times, taken), strict=True))
 
 
 class _Totals:
@@ -388,6 +403,7 @@ class _Totals:
     """
 
     def __init__(self, scene: Scene, x: np.ndarray, times: int, waits: np.ndarray, *, flows: bool) -> None:
+        """Begin the sums; filled cells are counted only if any material `flows`."""
         domain = scene.domain
         self._extent, self._waits = np.array(domain.size), waits
         self._low, self._high = np.full(times, np.inf), np.full(times, -np.inf)
@@ -415,6 +431,7 @@ class _Totals:
     def _add_active(
         self, x: np.ndarray, ratios: np.ndarray, constants: ParticleConstants, body: np.ndarray, status: np.ndarray
     ) -> None:
+        """Add particles that enter and leave, see `add`; only active ones count in extremes and filled cells."""
         for t, (place, J, state) in enumerate(zip(x, ratios, status, strict=True)):
             active = state == ACTIVE
             self._low[t] = J[active].min(initial=self._low[t])

@@ -113,6 +113,7 @@ class RunConstants:
         return self._table[:, 0]
 
     def of_rows(self, rows: slice) -> "ParticleConstants":
+        """Return the constants of the particles of some rows; those of all rows are computed once."""
         whole = rows.stop - rows.start == len(self.body)
         if whole and self._all is not None:
             return self._all
@@ -165,6 +166,7 @@ class ParticleConstants:
         return {name: np.asarray(self._field(name, arrays, ratios), real) for name in names}
 
     def _field(self, name: str, arrays: FrameArrays, ratios: np.ndarray) -> np.ndarray:
+        """Return a field by its name, (T, n) or (T, n, k); stress and pressure are those of Cauchy, Pa."""
         match name:
             case "volume_ratio":
                 return ratios

@@ -1,25 +1,16 @@
 """Reads the particle columns of a frame, and on the CPU the sums of the ledger."""
 
+from typing import Any, NamedTuple
+
 import numpy as np
 
 from mpmcli.quick_taichi import ti
 from mpmcli.solver.frames.builder import Sums, axis_pairs
 from mpmcli.solver.frames.columns import FrameColumns, stress_entries
-from mpmcli.solver.particles.arrays import MASS, VOLUME
+from mpmcli.solver.particles.arrays import MASS, VOLUME, ParticleArrays, constants_of
+from mpmcli.solver.particles.loop import Operation, Pass
 from mpmcli.solver.particles.sort import stay_rolled
 from mpmcli.solver.particles.state_bounds import SMALLEST_J, volume_ratio
-from mpmcli.solver.transfer.lanes import (
-    LANES,
-    constants_of,
-    internal_entries,
-    load_lanes,
-    load_rows,
-    matrix_of,
-    stored_entries,
-    stored_of,
-    vector_of,
-    zero_lanes,
-)
 from mpmcli.solver.transfer.volume import stretch_to
 
 # Index of the sum that is 0 if a particle is crushed, inverted or not finite, else 1.
@@ -28,133 +19,148 @@ SOUND = 5
 CHOSEN = ("affine", "gradient", "tau", "activity")
 
 
+class FrameRows(NamedTuple):
+    """Where the particles of a group are shown, attribute `rows` of the work of `show_of`, variables of a kernel.
+
+    The rows of neighbouring particles are far apart, because particles are sorted. The energy, J/m^3, of particle p is
+    therefore also stored in entry `offset` + p of the field `energies`, if it is not None, for the sums.
+
+    Attributes:
+        buffer: the `FrameColumns` of a frame.
+        row: row of the particle with id 0.
+        affine, gradient, tau, activity: first columns, -1 if omitted.
+        dt: the last step, s.
+        energies, offset: see above.
+    """
+
+    buffer: Any
+    row: Any
+    affine: Any
+    gradient: Any
+    tau: Any
+    activity: Any
+    dt: Any
+    energies: Any = None
+    offset: Any = 0
+
+
+class Showing(NamedTuple):
+    """The work of `show_of` on a GPU: a grid, a group of particles, and where they are shown."""
+
+    grid: Any
+    group: ParticleArrays
+    rows: FrameRows
+
+
+def show_of(group: ParticleArrays) -> Operation:
+    """Return the operation that writes the `FrameColumns` of particles, to `at.rows`.
+
+    It is carried out `turns` times, with the number of the turn as argument: in the first half a step back, at the time
+    of the velocities, for the energy. A loop, so that the law is compiled once. The state does not change: the next
+    step applies the plastic flow that is already included in the frame.
+    """
+    reads = ("C", "deformation", "inner", "row", *["to_mean"] * group.uses_f_bar, *["borne"] * group.eased)
+    state = {"inner": None, "deformation": None}
+    gives = {"energy": (), "J": (), **state, "tau": (len(stress_entries(group.dimension)),)}
+    return Operation(reads, (Pass(respond, gives, in_lanes=True), Pass(write_row)))
+
+
 @ti.func
-def deformed_on(law: ti.template(), stored: ti.template(), C: ti.template(), later: float):
-    """Return the deformation of a particle at a time `later`, s, after the stored one."""
-    state = stored
+def turns(group: ti.template(), rows: ti.template()):
+    """Return the number of turns of `show_of`."""
+    count = 1
+    if ti.static(group.law.projects) or rows.tau >= 0:
+        count = 2
+    return count
+
+
+@ti.func
+def respond(
+    at: ti.template(),
+    _p: int,
+    turn: float,
+    C: ti.template(),
+    deformation: ti.template(),
+    inner: ti.template(),
+    row: ti.template(),
+    to_mean: float,
+    borne: float,
+):
+    """Return energy, J/m^3, J, internal variables and J or F of a particle after plastic flow, and tau, Pa."""
+    group, d, law = ti.static((at.group, at.group.dimension, at.group.law))
+    stored, constants = group.whole(deformation), constants_of(row)
+    if ti.static(group.uses_f_bar):
+        stored *= stretch_to(to_mean, d)
+    later, state = 0.5 * (turn - 1.0) * at.rows.dt, stored
     if ti.static(law.deformation == "F"):
         state += later * (C @ stored)
     else:
         state *= 1.0 + later * C.trace()
-    return state
-
-
-def is_there(field: object) -> bool:
-    return field is not None
+    tau, tau_zz, after, inner_after = law.respond(state, inner, C, at.rows.dt, constants)
+    share = 1.0
+    if ti.static(group.eased):
+        share = borne
+        tau, tau_zz = law.eased(tau, tau_zz, borne)
+    energy = share * law.energy(after, inner_after, constants)
+    if ti.static(not law.projects):
+        after = stored
+        inner_after = inner
+    J = 0.0
+    if ti.static(law.deformation == "F"):
+        J = after.determinant()
+    else:
+        J = after
+    shown = ti.Vector.zero(float, ti.static(len(stress_entries(d))))
+    for column, place in ti.static(enumerate(stress_entries(d))):
+        if ti.static(place[0] < d and place[1] < d):
+            shown[column] = tau[place[0], place[1]]
+        else:
+            shown[column] = tau_zz
+    return energy, J, inner_after, after, shown
 
 
 @ti.func
-def write_range(
-    group: ti.template(),
-    first: int,
-    count: int,
-    dt: float,
-    row: int,
-    affine_at: int,
-    gradient_at: int,
-    tau_at: int,
-    activity_at: int,
-    frame_buffer: ti.template(),
-    energies: ti.template(),
-    offset: int,
+def write_row(
+    at: ti.template(),
+    p: int,
+    turn: float,
+    energy: float,
+    J: float,
+    inner: ti.template(),
+    deformation: ti.template(),
+    tau: ti.template(),
 ):
-    """Write the `FrameColumns` of some particles, each to row `row` plus its id.
-
-    The rows of neighbouring particles are far apart, because particles are sorted. The energy, J/m^3, of particle p is
-    therefore also stored in entry `offset` + p of the field `energies`, if it is not None, for the sums. The state does
-    not change: the next step applies the plastic flow that is already included in the frame.
-
-    Args:
-        group: the group of particles.
-        first, count: first particle and number of particles.
-        dt: the last step, s.
-        row: row of the particle with id 0.
-        affine_at, gradient_at, tau_at, activity_at: first columns, -1 if omitted.
-        frame_buffer: the rows of the frame.
-        energies, offset: see above.
-    """
-    d = ti.static(group.dimension)
-    keeps_F = ti.static(group.law.deformation == "F")
-    inner_count = ti.static(len(group.internal))
-    inners = ti.static(internal_entries(group))
-    entries = ti.static(tuple(enumerate(stress_entries(group.dimension))))
-    affine, deformation = zero_lanes(ti.static(d * d)), zero_lanes(ti.static(stored_entries(group)))
-    internal, rows = zero_lanes(inners), zero_lanes(ti.static(group.table.n))
-    # Energy, J, internal variables, and entries of the deformation and of the stress.
-    found = zero_lanes(ti.static(2 + inners + d * d + len(entries)))
-    missing = ti.Vector.zero(float, LANES)
-    turns = 1
-    if ti.static(group.law.projects) or tau_at >= 0:
-        turns = 2
-    begin = first
-    while begin < first + count:
-        own = ti.min(LANES, first + count - begin)
-        load_lanes(group, begin, own, affine, deformation, internal)
-        load_rows(group, begin, own, rows)
-        if ti.static(group.uses_f_bar):
-            for lane in range(own):
-                missing[lane] = group.to_mean[begin + lane]
-        # Half a step back, at the time of the velocities, and now; a loop, so that the law is compiled once.
-        for k in range(turns):
-            for lane in range(LANES):
-                C, inner = matrix_of(affine, 0, d, lane), vector_of(internal, 0, inners, lane)
-                stored, constants = stored_of(group, deformation, lane), constants_of(rows, lane)
-                if ti.static(group.uses_f_bar):
-                    stored *= stretch_to(missing[lane], d)
-                state = deformed_on(group.law, stored, C, 0.5 * (k - 1) * dt)
-                tau, tau_zz, after, inner_after = group.law.respond(state, inner, C, dt, constants)
-                borne = 1.0
-                if ti.static(group.eased):
-                    borne = group.borne[begin + ti.min(lane, own - 1)]
-                    tau, tau_zz = group.law.eased(tau, tau_zz, borne)
-                if k == 0:
-                    found[0, lane] = borne * group.law.energy(after, inner_after, constants)
-                if ti.static(not group.law.projects):
-                    after = stored
-                    inner_after = inner
-                for i in ti.static(range(inners)):
-                    found[2 + i, lane] = inner_after[i]
-                if ti.static(keeps_F):
-                    found[1, lane] = after.determinant()
-                    for i, j in ti.static(ti.ndrange(d, d)):
-                        found[2 + inners + i * d + j, lane] = after[i, j]
-                else:
-                    found[1, lane] = after
-                for column, place in ti.static(entries):
-                    if ti.static(place[0] < d and place[1] < d):
-                        found[2 + inners + d * d + column, lane] = tau[place[0], place[1]]
-                    else:
-                        found[2 + inners + d * d + column, lane] = tau_zz
-        for lane in range(own):
-            p = begin + lane
-            r = row + group.id[p]
-            if ti.static(is_there(energies)):
-                energies[offset + p] = found[0, lane]
-            velocity, C = group.motion(p)
-            place = group.place(p)
-            for c in ti.static(range(d)):
-                frame_buffer[r, c] = place[c]
-                frame_buffer[r, d + c] = velocity[c]
-            for i in ti.static(range(2 + inner_count)):
-                frame_buffer[r, 2 * d + i] = found[i, lane]
-            if affine_at >= 0:
-                for i, j in ti.static(ti.ndrange(d, d)):
-                    frame_buffer[r, affine_at + i * d + j] = C[i, j]
-            if gradient_at >= 0:
-                if ti.static(keeps_F):
-                    for i, j in ti.static(ti.ndrange(d, d)):
-                        frame_buffer[r, gradient_at + i * d + j] = found[2 + inners + i * d + j, lane]
+    """Write the energy of a particle in the first turn, and all else in the last one."""
+    group, rows, buffer, d = ti.static((at.group, at.rows, at.rows.buffer, at.group.dimension))
+    r = rows.row + group.id[p]
+    if turn == 0.0:
+        buffer[r, 2 * d] = energy
+        if ti.static(isinstance(rows.energies, ti.Field)):
+            rows.energies[rows.offset + p] = energy
+    if turn == ti.cast(turns(group, rows) - 1, float):
+        velocity, C = group.motion(p)
+        place = group.place(p)
+        for c in ti.static(range(d)):
+            buffer[r, c] = place[c]
+            buffer[r, d + c] = velocity[c]
+        buffer[r, 2 * d + 1] = J
+        for i in ti.static(range(len(group.internal))):
+            buffer[r, 2 * d + 2 + i] = inner[i]
+        if rows.affine >= 0:
+            for i, j in ti.static(ti.ndrange(d, d)):
+                buffer[r, rows.affine + i * d + j] = C[i, j]
+        if rows.gradient >= 0:
+            for i, j in ti.static(ti.ndrange(d, d)):
+                if ti.static(group.law.deformation == "F"):
+                    buffer[r, rows.gradient + i * d + j] = deformation[i, j]
                 else:
                     # The isotropic F with this volume ratio.
-                    stretch = found[1, lane] ** ti.static(1.0 / group.dimension)
-                    for i, j in ti.static(ti.ndrange(d, d)):
-                        frame_buffer[r, gradient_at + i * d + j] = stretch if ti.static(i == j) else 0.0
-            if tau_at >= 0:
-                for column in ti.static(range(len(entries))):
-                    frame_buffer[r, tau_at + column] = found[2 + inners + d * d + column, lane]
-            if ti.static(group.particle_count_varies):
-                frame_buffer[r, activity_at] = ti.cast(group.activity[p], float)
-        begin += LANES
+                    buffer[r, rows.gradient + i * d + j] = J ** ti.static(1.0 / d) if ti.static(i == j) else 0.0
+        if rows.tau >= 0:
+            for column in ti.static(range(tau.n)):
+                buffer[r, rows.tau + column] = tau[column]
+        if ti.static(group.particle_count_varies):
+            buffer[r, rows.activity] = ti.cast(group.activity[p], float)
 
 
 def sum_entries(dimension: int) -> int:
@@ -163,7 +169,7 @@ def sum_entries(dimension: int) -> int:
 
 @ti.func
 def sum_range(group: ti.template(), first: int, count: int, energies: ti.template(), offset: int):
-    """Return float64 sums over some particles in fixed order, see `sums_of`; for `energies` see `write_range`."""
+    """Return float64 sums over some particles in fixed order, see `sums_of`; for `energies` see `FrameRows`."""
     d = ti.static(group.dimension)
     pairs = ti.static(axis_pairs(group.dimension))
     turns = ti.static(len(axis_pairs(group.dimension)))

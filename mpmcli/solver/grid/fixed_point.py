@@ -22,7 +22,7 @@ WIDE = ("cpu", "cuda")
 # Bits of the largest permitted sum. Eight times as much fits, so that a sum that is too large can be detected.
 BITS_OF_WIDE, BITS_OF_HIGH = 60, 28
 # Bits of the lower of two integers per added number: any 2**17 numbers can be added without overflow.
-LOW_BITS = 15
+BITS_OF_LOW = 15
 # Largest exponent of a scale; it fits single precision.
 LARGEST_EXPONENT = 120
 
@@ -33,7 +33,7 @@ class FixedSums:
 
     Attributes:
         width: numbers per vector.
-        wide: whether each sum is one 64-bit integer; otherwise it is two 32-bit integers, the lower one with LOW_BITS.
+        wide: whether each sum is one 64-bit integer; otherwise it is two 32-bit integers, the lower with BITS_OF_LOW.
         largest: the largest permitted scaled sum.
     """
 
@@ -65,7 +65,7 @@ class FixedSums:
                 ti.atomic_add(self.high[place][c], ti.cast(whole, ti.i64))
             else:
                 # This difference is exact.
-                rest = ti.round((share[c] - whole) * ti.static(2.0**LOW_BITS))
+                rest = ti.round((share[c] - whole) * ti.static(2.0**BITS_OF_LOW))
                 ti.atomic_add(self.high[place][c], ti.cast(whole, ti.i32))
                 ti.atomic_add(self.low[place][c], ti.cast(rest, ti.i32))
 
@@ -76,16 +76,16 @@ class FixedSums:
         for c in ti.static(range(self.width)):
             result[c] = ti.cast(self.high[place][c], float)
             if ti.static(not self.wide):
-                result[c] += ti.cast(self.low[place][c], float) * ti.static(2.0**-LOW_BITS)
+                result[c] += ti.cast(self.low[place][c], float) * ti.static(2.0**-BITS_OF_LOW)
         return result
 
 
 FARTHEST, DENSEST = 16.0, 32.0
-# Bound on the sum of filled fractions at one fine node.
-CROWDED = 4096.0
+# Bound on a displacement, cells.
+LARGEST_WAY = 4.0
 # Bound to which ln J is clamped; it exceeds |ln J| of the smallest J.
 LARGEST_LOG = 16.0
-NOTHING = 2**31 - 1
+NO_INDEX = 2**31 - 1
 # Indices into the scales of a run: scales of masses, of volumes, of volumes and of logarithms summed over a cell, a
 # bound on the mass of a node, kg, and the scale of momenta per second of the stable step.
 OF_MASS, OF_VOLUME, OF_CELL, OF_LOG, HEAVIEST, PER_STEP, SCALES = range(7)
@@ -97,14 +97,12 @@ class FixedPoint:
 
     Attributes:
         parts: `Grid.parts`.
-        fine: sums of the filled fraction of fine cells; None without shifts.
-        of_fine: scale of `fine`.
         reach: cells from the middle node of a stencil to its farthest node.
         run: number of the run of a view.
         scales: scales of each run, see OF_MASS.
         pace: for each run the scale of momenta, its inverse, and the largest speed for which no sum overflows, m/s.
         beyond: per run, the smallest id of a particle that is too fast for the sums, and the smallest index of a node
-            that is too heavy; NOTHING if there is none.
+            that is too heavy; NO_INDEX if there is none.
     """
 
     def __init__(self, grid: Grid, groups: Sequence[ParticleArrays], arch: str) -> None:
@@ -114,9 +112,8 @@ class FixedPoint:
         self.nodes = sums(grid.width)
         self.filling = sums(grid.kept) if grid.keeps_filling else None
         self.means = tuple(sums(4) if group.averages else None for group in groups)
-        wide, fine = arch in WIDE, grid.fine
-        self.fine = FixedSums(1, grid.runs * fine.node_count, wide=wide) if fine else None
-        self.of_fine = self.fine.scale(CROWDED) if fine else 0.0
+        if grid.fine:
+            grid.fine.add_in_fixed_point(FixedSums(1, grid.runs * grid.fine.node_count, wide=arch in WIDE))
         self.kept = tuple(sums for sums in (self.nodes, self.filling, *self.means) if sums is not None)
         self.parts = grid.parts
         self.stencil, self.reach = grid.scheme.spline.nodes, grid.scheme.spline.nodes - 2
@@ -151,12 +148,12 @@ class FixedPoint:
 
     def forget(self, run: int) -> None:
         for k in range(2):
-            self.beyond[2 * run + k] = NOTHING
+            self.beyond[2 * run + k] = NO_INDEX
 
     def found_beyond(self, run: int) -> tuple[int | None, int | None]:
         """Return the id of a particle that is too fast and the index of a node that is too heavy, or None."""
         particle, node = self.beyond.to_numpy()[2 * run : 2 * run + 2].tolist()
-        return None if particle == NOTHING else particle, None if node == NOTHING else node - run * self._node_count
+        return None if particle == NO_INDEX else particle, None if node == NO_INDEX else node - run * self._node_count
 
     @ti.func
     def clear(self, node: int):
@@ -180,6 +177,16 @@ class FixedPoint:
                 fits = fits and largest <= most
             middle[first + d] *= self.scales[self.run][OF_MASS]
         return fits
+
+    @ti.func
+    def largest_way(self, spacing: float):
+        """Return the inverse of `way_scale`, s."""
+        return LARGEST_WAY * spacing / self.pace[self.run][2]
+
+    @ti.func
+    def way_scale(self, inverse_spacing: float):
+        """Return the factor from a displacement, m, to a speed within the range of the sums."""
+        return self.pace[self.run][2] * ti.static(1.0 / LARGEST_WAY) * inverse_spacing
 
     @ti.func
     def volume_scale(self):

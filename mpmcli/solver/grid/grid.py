@@ -3,14 +3,15 @@
 import math
 from collections.abc import Sequence
 from copy import copy
+from typing import Any
 
 import numpy as np
 
 from mpmcli.boundaries.images import Images
-from mpmcli.boundaries.walls import REACH
+from mpmcli.boundaries.walls import IMAGE_DEPTH
 from mpmcli.quick_taichi import ti
 from mpmcli.solver.grid.period import Period
-from mpmcli.solver.transfer.splines import PAD, TransferScheme
+from mpmcli.solver.transfer.splines import LOW_BITS, PAD, TransferScheme, bounded
 
 # Margin of the drift of particles for the rounding of positions, cells.
 ROUNDING = 0.02
@@ -42,7 +43,7 @@ def node_width(dimension: int, *, on_cpu: bool) -> int:
 class LinearNodes:
     """Nodes of a box, addressed by one linear index with `strides` per axis; `first_node` is the index of node 0."""
 
-    sparse, layers = False, 1
+    sparse, layers, deterministic, fixed = False, 1, False, None
     dimension: int
     strides: tuple[int, ...]
     first_node: int
@@ -57,6 +58,50 @@ class LinearNodes:
         for a in ti.static(range(self.dimension)):
             index += base[a] * self.strides[a]
         return index
+
+    @ti.func
+    def node_of(self, origin: int, i: ti.template(), j: ti.template(), k: ti.template()):
+        """Return the linear index of node k of line j in plane i of a stencil, given its `origin_of`."""
+        return origin + ti.static(self.line_node(i, j) + k)
+
+    @ti.func
+    def origin_of(self, first: int):
+        """Return `stencil_at` of the first node of a stencil, `bounded` if there are at most LOW_BITS nodes."""
+        if ti.static(self.runs * self.layers * self.node_count <= LOW_BITS):
+            return bounded(first)
+        else:
+            return first
+
+    @property
+    def sums(self) -> Any:
+        """What particles add to: `nodes`, or sums in fixed point, for numbers that are `scaled`."""
+        return self.fixed.nodes if self.fixed else self.nodes
+
+    @property
+    def volume_sums(self) -> Any:
+        """The same for `filling`, for volumes times `volume_scale`."""
+        return self.fixed.filling if self.fixed else self.filling
+
+    @ti.func
+    def scaled(self, mass: float, middle: ti.template(), change: ti.template()):
+        """Scale the contribution of a particle to its stencil for `sums`; return whether no sum can overflow."""
+        fits = True
+        if ti.static(self.deterministic):
+            fits = self.fixed.scaled(mass, middle, change)
+        return fits
+
+    @ti.func
+    def note(self, particle: int):
+        """Record that a particle is too fast for `sums`."""
+        if ti.static(self.deterministic):
+            self.fixed.note(particle)
+
+    @ti.func
+    def volume_scale(self):
+        scale = 1.0
+        if ti.static(self.deterministic):
+            scale = self.fixed.volume_scale()
+        return scale
 
     @ti.func
     def stencil_at(self, base: ti.template()):
@@ -103,7 +148,7 @@ class Grid(LinearNodes):
         fixed: sums in fixed point, which `FixedPoint.to_float` converts to the fields; None if P2G adds to the fields
             directly.
         deterministic: whether `fixed` is not None; then all `means` are None.
-        fine: the fine grid for shifts of particles (`redistribution.FineGrid`); None without shifts.
+        fine: the fine grid for shifts of particles (`fine_grid.FineGrid`); None without shifts.
         box: (2, d) ints: first node in use and number of nodes in use, per axis.
         own: the same for the nodes in use of a layer, within the rows of the box; None if the layer uses the whole box.
     """
@@ -149,7 +194,7 @@ class Grid(LinearNodes):
         )
         self.kept_means = tuple(means for means in self.means if means is not None)
         self.period = period
-        self.deterministic, self.fixed, self.fine = deterministic, None, None
+        self.deterministic, self.fine = deterministic, None
         self.box = ti.field(int, shape=(2 * runs, len(cells)))
 
     def in_layer(self, layer: object, own: object) -> "Grid":
@@ -159,7 +204,9 @@ class Grid(LinearNodes):
         return view
 
     def within(self, box: object) -> "Grid":
-        """Return a view with a smaller box in use, which is a variable of a kernel."""
+        """Return a view of one of several layers with its own box in use, which is a variable of a kernel."""
+        if self.layers == 1:
+            return self
         view = copy(self)
         view.box = box
         return view
@@ -190,6 +237,45 @@ class Grid(LinearNodes):
                 means[node] = ti.Vector.zero(float, 4)
 
     @ti.func
+    def clear_mean(self, g: ti.template(), cell: int):
+        """Clear the sums of a cell for the g-th group, see `means`."""
+        if ti.static(self.deterministic):
+            self.fixed.means[g].clear(cell)
+        else:
+            self.means[g][cell] = ti.Vector.zero(float, 4)
+
+    @ti.func
+    def add_mean(
+        self, g: ti.template(), cell: int, first: ti.template(), volume: float, value: float, atomic: ti.template()
+    ):
+        """Add a value times the volume of a particle, and the volume, m^3, to two entries of `means`."""
+        if ti.static(self.deterministic):
+            self.fixed.add_mean(g, cell, first, volume, value)
+        elif ti.static(atomic):
+            ti.atomic_add(self.means[g][cell][first], volume * value)
+            ti.atomic_add(self.means[g][cell][ti.static(first + 1)], volume)
+        else:
+            more = ti.Vector.zero(float, 4)
+            more[first], more[ti.static(first + 1)] = value, 1.0
+            self.means[g][cell] = self.means[g][cell] + volume * more
+
+    @ti.func
+    def mean(self, g: ti.template(), cell: int):
+        """Return the entry of `means` of the g-th group for a cell."""
+        if ti.static(self.deterministic):
+            return self.fixed.mean(g, cell)
+        else:
+            return self.means[g][cell]
+
+    @ti.func
+    def way_scale(self):
+        """Return the factor of displacements, m, in `sums`, which have speeds."""
+        scale = 1.0
+        if ti.static(self.deterministic):
+            scale = self.fixed.way_scale(self.inverse_spacing)
+        return scale
+
+    @ti.func
     def part(self, index: int, first: ti.template()):
         """Return the values of one of the `parts` of a node; `first` is the index of its first number."""
         if ti.static(len(self.parts) == 1):
@@ -216,7 +302,8 @@ class Grid(LinearNodes):
         return tile
 
     @ti.func
-    def place_of(self, index: int):
+    def node_at(self, index: int):
+        """Return the integer coordinates of a node, given its linear index."""
         place = ti.Vector.zero(int, self.dimension)
         rest = index - self.first_node
         for a in ti.static(range(self.dimension)):
@@ -301,12 +388,12 @@ def box_of(grid: ti.template(), axis: ti.template(), low: int, high: int, drift:
     else:
         if ti.static((axis, 0) not in grid.images.mirrors):
             first = ti.max(first, 0)
-        elif first <= PAD + REACH:
-            first = PAD - REACH
+        elif first <= PAD + IMAGE_DEPTH:
+            first = PAD - IMAGE_DEPTH
         if ti.static((axis, 1) not in grid.images.mirrors):
             last = ti.min(last, last_wall + PAD)
-        elif last >= last_wall - REACH:
-            last = last_wall + REACH
+        elif last >= last_wall - IMAGE_DEPTH:
+            last = last_wall + IMAGE_DEPTH
     return first, last
 
 

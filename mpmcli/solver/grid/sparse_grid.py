@@ -12,7 +12,7 @@ from copy import copy
 import numpy as np
 import psutil
 
-from mpmcli.boundaries.walls import REACH
+from mpmcli.boundaries.walls import IMAGE_DEPTH
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
 from mpmcli.scene.contact_table import ContactTable
@@ -71,6 +71,10 @@ class BlockNodes(LinearNodes):
         return offsets
 
     @ti.func
+    def origin_of(self, offsets: ti.template()):
+        return offsets
+
+    @ti.func
     def node_of(self, offsets: ti.template(), i: ti.template(), j: ti.template(), k: ti.template()):
         """Return the linear index of node k of line j in plane i of the stencil with these offsets."""
         d = ti.static(self.dimension)
@@ -98,6 +102,7 @@ class TileWindow(LinearNodes):
     runs = 1
 
     def __init__(self, grid: Grid, threads: int) -> None:
+        """Allocate a window for each thread: a tile of the grid, and the nodes beyond it that stencils reach."""
         d = self.dimension = grid.dimension
         self.before_tile, self.behind_tile = grid.beyond
         self.tile, self.tiles = grid.tile, grid.tiles
@@ -105,7 +110,7 @@ class TileWindow(LinearNodes):
         self.strides = tuple(edge ** (d - 1 - a) for a in range(d))
         self.size = edge**d
         self.node_count, self.first_node = threads * self.size, 0
-        for name in ("width", "kept", "planes", "scheme", "deterministic"):
+        for name in ("width", "kept", "planes", "scheme"):
             setattr(self, name, getattr(grid, name))
         self.nodes, self.filling = (
             None if field is None else ti.Vector.field(field.n, float, shape=self.node_count)
@@ -303,7 +308,8 @@ class SparseGrid(BlockNodes, Grid):
         return place
 
     @ti.func
-    def place_of(self, index: int):
+    def node_at(self, index: int):
+        """Return the integer coordinates of a node, given its linear index."""
         place = self.tile_place(self.tile_at[index // ti.static(self.block)])
         rest = index % ti.static(self.block)
         for b in ti.static(range(self.dimension)):
@@ -319,7 +325,7 @@ class SparseGrid(BlockNodes, Grid):
 
     @ti.func
     def row_start(self, row: int):
-        return self.place_of(ti.static(self.block) + row * ti.static(self.tile))
+        return self.node_at(ti.static(self.block) + row * ti.static(self.tile))
 
     @ti.func
     def row_length(self, _start: ti.template()):
@@ -453,9 +459,9 @@ def reach_along(cells: int, tile: int, beyond: tuple[int, int], *, repeats: bool
             if high >= last - PAD:
                 ranges.append((max(low, last - PAD) - cells, high - cells))
         else:
-            if low <= PAD + REACH:
+            if low <= PAD + IMAGE_DEPTH:
                 ranges.append((0, low))
-            if high >= last - REACH:
+            if high >= last - IMAGE_DEPTH:
                 ranges.append((high, tiles * tile - 1))
         own = {k for first, after in ranges for k in range(max(first // tile, 0), min(after // tile, tiles - 1) + 1)}
         found.append(sorted(own))

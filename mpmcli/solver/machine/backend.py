@@ -271,6 +271,7 @@ def launcher(kernel: Callable, *arguments: int) -> Callable[[], None]:
 
 
 def _initialise(backend: Backend) -> None:
+    """Start Taichi with the settings of a backend. Raises InputError if the device is missing or another one starts."""
     if not backend_is_here(backend.arch):
         raise InputError(f"--arch {backend.arch} needs a device that this machine does not have; use --arch cpu.")
     arch = getattr(ti, backend.arch)

@@ -92,6 +92,7 @@ class Emission:
     """
 
     def __init__(self, inflow: Inflow, dimension: int, runs: int = 1) -> None:
+        """Allocate the mouths of the emitters of a number of runs; no field is empty."""
         self.members = tuple(enumerate(inflow.groups))
         self.dimension, self.runs, d = dimension, runs, dimension
         n = max(1, len(self.members))

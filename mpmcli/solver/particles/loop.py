@@ -3,7 +3,13 @@
 An operation is a list of passes. A pass is a function of a particle that takes values by the names of its parameters,
 and returns others: columns of the particles that the operation reads, and what earlier passes gave. On a GPU, and on a
 sparse grid, a particle goes through all passes by itself. On a dense grid on the CPU each pass is a loop over LANES
-particles, which the compiler vectorises if the pass accesses its values only; see `lanes`.
+particles.
+
+The compiler vectorises such a loop, including its branches, if it accesses only local arrays and calls no functions. It
+does not vectorise a loop that stores to fields, because Taichi reloads the address of a field after every store.
+Therefore columns are copied to and from local arrays with a row per number and a column per lane, by one short loop per
+number, so that the compiler copies all lanes at once. Each lane computes the same result as a particle alone. Lanes
+beyond the last particle repeat the first one: their results are not used, but laws may iterate until convergence.
 """
 
 import inspect
@@ -13,17 +19,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from mpmcli.quick_taichi import ti
+from mpmcli.solver.particles.columns import column_of, entry_of_field, set_entry
 from mpmcli.solver.particles.sort import stay_rolled
 from mpmcli.solver.particles.state_bounds import NOTHING
-from mpmcli.solver.transfer.lanes import (
-    LANES,
-    load_entry,
-    load_rows,
-    repeat_first,
-    store_lanes,
-)
 from mpmcli.solver.transfer.splines import bounded
 
+LANES = 8
 # Parameters of a pass before its values: the work of a thread, the index of the particle, and the argument of `over`.
 ALWAYS = 3
 # Sizes of values that are integers: an index, and the address of a stencil, which has several on a sparse grid.
@@ -65,6 +66,7 @@ class Operation:
         writes: columns that take the values with their names at the end.
         guarded: columns that are written only if the value "sound" of the particle is 1. Else it is lost.
         largest: a value of which the largest is returned.
+        near: whether its passes address nodes by `at.particles.near`: on a sparse grid those of the window of a thread.
     """
 
     reads: tuple[str, ...]
@@ -72,6 +74,7 @@ class Operation:
     writes: tuple[str, ...] = ()
     guarded: tuple[str, ...] = ()
     largest: str = ""
+    near: bool = False
 
     @property
     def loses(self) -> bool:
@@ -158,6 +161,7 @@ def empty(shape: tuple, by_lane: bool) -> ti.Matrix:
 
 @ti.func
 def value_of(lanes: ti.template(), shape: ti.template(), lane: int, by_lane: ti.template()):
+    """Return a value of a lane, in its shape."""
     if ti.static(len(shape) == 2):
         value = ti.Matrix.zero(float, shape[0], shape[1])
         for i, j in ti.static(ti.ndrange(shape[0], shape[1])):
@@ -187,13 +191,13 @@ def set_value(lanes: ti.template(), shape: ti.template(), lane: int, by_lane: ti
     else:
         for k in ti.static(range(math.prod(shape))):
             if ti.static(by_lane):
-                lanes[lane, k] = entry_of(value, shape, k)
+                lanes[lane, k] = number_of(value, shape, k)
             else:
-                lanes[k, lane] = entry_of(value, shape, k)
+                lanes[k, lane] = number_of(value, shape, k)
 
 
 @ti.func
-def entry_of(value: ti.template(), shape: ti.template(), k: ti.template()):
+def number_of(value: ti.template(), shape: ti.template(), k: ti.template()):
     """Return entry k, row by row, of a value."""
     if ti.static(len(shape) == 2):
         return value[k // shape[1], k % shape[1]]
@@ -201,42 +205,6 @@ def entry_of(value: ti.template(), shape: ti.template(), k: ti.template()):
         return value[k]
     else:
         return value
-
-
-@ti.func
-def column_of(group: ti.template(), name: ti.template(), p: int):
-    """Return the value of a column of particle p."""
-    (column,) = ti.static((group.column(name),))
-    if ti.static(name == "row"):
-        return group.row(p)
-    elif ti.static(len(column.shape) == 0):
-        return column.entries[0][0][p]
-    else:
-        value = ti.Matrix.zero(float, *column.shape)
-        for k in ti.static(range(len(column.entries))):
-            number = entry_of_field(column.entries[k], p)
-            if ti.static(len(column.shape) == 2):
-                value[k // column.shape[1], k % column.shape[1]] = number
-            else:
-                value[k] = number
-        return value
-
-
-@ti.func
-def entry_of_field(entry: ti.template(), p: int):
-    """Return a number of particle p, given its field and the entry of it."""
-    if ti.static(len(entry[1]) == 0):
-        return entry[0][p]
-    else:
-        return entry[0][p][entry[1]]
-
-
-@ti.func
-def set_entry(entry: ti.template(), p: int, number: float):
-    if ti.static(len(entry[1]) == 0):
-        entry[0][p] = number
-    else:
-        entry[0][p][entry[1]] = number
 
 
 @ti.func
@@ -280,7 +248,12 @@ def one(at: ti.template(), op: ti.template(), p: int, how: float):
 def write_one(column: ti.template(), p: int, value: ti.template()):
     """Set a column of particle p."""
     for k in ti.static(range(len(column.entries))):
-        set_entry(column.entries[k], p, entry_of(value, column.shape, k))
+        set_entry(column.entries[k], p, number_of(value, column.shape, k))
+
+
+def in_window(op: Operation | Callable, grid: Any) -> bool:
+    """Return whether an operation is carried out tile by tile."""
+    return grid.sparse and isinstance(op, Operation) and op.near
 
 
 def goes_in_lanes(op: Operation | Callable, grid: Any) -> bool:
@@ -315,7 +288,7 @@ def over_lanes(at: ti.template(), op: ti.template(), first: int, last: int, how:
         for name in ti.static(at.group.distinct(op.reads)):
             (column, lanes) = ti.static((at.group.column(name), values.arrays[name]))
             for k in ti.static(range(len(column.entries))):
-                load_entry(lanes, k, column.entries[k][0], ti.static(column.entries[k][1]), origin)
+                load_lanes(column.entries[k], origin, lanes, k)
             if ti.static(name == "row"):
                 if ti.static(at.group.many_bodies):
                     load_rows(at.group, begin, count, lanes)
@@ -342,8 +315,7 @@ def over_lanes(at: ti.template(), op: ti.template(), first: int, last: int, how:
             for name in ti.static(op.writes + op.guarded):
                 (column,) = ti.static((at.group.column(name),))
                 for k in ti.static(range(len(column.entries))):
-                    (field, entry) = ti.static(column.entries[k])
-                    store_lanes(field, entry, origin, values.arrays[name], k)
+                    store_lanes(column.entries[k], origin, values.arrays[name], k)
         else:
             for lane in range(count):
                 stay_rolled(at.order.buffers.real, begin + lane)
@@ -364,3 +336,41 @@ def write_lane(at: ti.template(), names: ti.template(), values: ti.template(), p
         (column,) = ti.static((at.group.column(name),))
         for k in ti.static(range(len(column.entries))):
             set_entry(column.entries[k], p, values.arrays[name][k, lane])
+
+
+@ti.func
+def load_lanes(entry: ti.template(), origin: int, lanes: ti.template(), k: ti.template()):
+    """Copy an entry of the particles from `origin` on to row k of an array; all are read before any is written."""
+    row = ti.Vector.zero(float, LANES)
+    for lane in range(LANES):
+        row[lane] = entry_of_field(entry, origin + lane)
+    for lane in range(LANES):
+        lanes[k, lane] = row[lane]
+
+
+@ti.func
+def store_lanes(entry: ti.template(), origin: int, lanes: ti.template(), k: ti.template()):
+    """Store row k of an array as an entry of the particles from `origin` on; all are read before any is stored."""
+    row = ti.Vector.zero(float, LANES)
+    for lane in range(LANES):
+        row[lane] = lanes[k, lane]
+    for lane in range(LANES):
+        set_entry(entry, origin + lane, row[lane])
+
+
+@ti.func
+def repeat_first(lanes: ti.template(), count: int):
+    """Copy lane 0 to the lanes from `count` on, which were loaded from memory beyond the last particle."""
+    for lane in range(count, LANES):
+        for k in ti.static(range(lanes.n)):
+            lanes[k, lane] = lanes[k, 0]
+
+
+@ti.func
+def load_rows(group: ti.template(), begin: int, count: int, rows: ti.template()):
+    """Copy the table rows of `count` particles from `begin` on; with one body all lanes have the same row."""
+    for lane in range(LANES):
+        # Memory beyond the last particle holds no row number of the table.
+        row = group.row(begin + ti.min(lane, count - 1))
+        for k in ti.static(range(row.n)):
+            rows[k, lane] = row[k]

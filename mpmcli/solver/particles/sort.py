@@ -44,7 +44,7 @@ class SortBuffers:
     def __init__(self, groups: Sequence[ParticleArrays], runs: int = 1) -> None:
         n = max(group.capacity for group in groups)
         self.capacity = n // runs
-        self.widest = max(len(groups), *(entry_count(field) for group in groups for field in group.state))
+        self.widest = max(len(groups), *(entry_count(field) for group in groups for field in group.moved))
         self.order = ti.field(int, shape=n)
         self.key = ti.field(int, shape=n)
         self.real = ti.field(float, shape=n * self.widest)
@@ -73,6 +73,7 @@ class TileOrder:
     """
 
     def __init__(self, group: ParticleArrays, grid: Grid, buffers: SortBuffers, threads: int, runs: int = 1) -> None:
+        """Allocate the bins of a group on a grid; `threads` is the number of shares in which particles are counted."""
         self.group, self.grid, self.buffers, self.threads = group, grid, buffers, threads
         self.tiles = self.bins_of(grid)
         # If particles come and go, the tiles are followed by a bin of waiting and blocked particles and a bin of

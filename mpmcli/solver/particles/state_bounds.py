@@ -116,6 +116,7 @@ def widen_motion(own: ti.template(), v: ti.template(), rate: float):
 
 @ti.func
 def widen_state(group: ti.template(), own: ti.template(), p: int):
+    """Raise the maxima `own` to the state of particle p: J, -J, its squared stretch and its internal variables."""
     deformation = group.stored(p)
     J = volume_ratio(group, deformation)
     own[J_MAX] = ti.max(own[J_MAX], J)
@@ -167,6 +168,7 @@ def build_maxima(size: int, widen: Callable, backend: Backend) -> Callable[[int,
 
     @ti.kernel
     def reduce(first: int, count: int, run: int) -> vector:
+        """Return the maxima over `count` particles of a run from `first` on, a vector of `size` numbers."""
         for i in ti.static(range(size)):
             found.reset(0, i, NOTHING)
         for q in range(workers):

@@ -1,7 +1,7 @@
 """G2P: particles take velocity and its gradient from nodes, and move (docs/theory.md, 2)."""
 
 from mpmcli.quick_taichi import ti
-from mpmcli.solver.particles.arrays import CONSTANTS, ParticleArrays
+from mpmcli.solver.particles.arrays import ParticleArrays, constants_of
 from mpmcli.solver.particles.loop import INDEX, Operation, Pass
 from mpmcli.solver.transfer.particle_step import NodeSums, Receiver, g2p
 from mpmcli.solver.transfer.stencils import columns, gather_linear
@@ -39,6 +39,7 @@ def advance_of(group: ParticleArrays, *, keeps: bool) -> Operation:
         writes=("v", "C", "deformation", *["remainder"] * group.carries, *["growth"] * group.evened),
         guarded=("x",),
         largest="rate",
+        near=True,
     )
 
 
@@ -80,8 +81,7 @@ def move(
     kept = ti.static(grid.kept if grid.scheme.keeps_flip_velocity else 0)
     velocity, moment = columns(sums, moments, 0, d)
     old_velocity, old_moment = columns(sums, moments, kept, d)
-    constants = ti.Vector([row[CONSTANTS + c] for c in ti.static(range(row.n - CONSTANTS))])
-    (own,) = ti.static((Receiver(x, remainder, v, C, deformation, constants, share, missing),))
+    (own,) = ti.static((Receiver(x, remainder, v, C, deformation, constants_of(row), share, missing),))
     (nodes,) = ti.static((NodeSums(apart, velocity, moment, old_velocity, old_moment),))
     v_after, C_after, inside, left, beyond, state, growth, rate, slope = g2p(
         at.particles, group, own, nodes, dt, at.gravity_step
@@ -98,5 +98,12 @@ def move(
 
 @ti.func
 def carry_surface(at: ti.template(), p: int, dt: float, slope: ti.template()):
-    """Turn the normal of a particle whose law projects F, and change its depth."""
-    at.group.carry_surface(p, slope, dt)
+    """Change the normal and the depth of particle p, whose law projects F, to (I + dt C)^-T n and D, over |n|."""
+    group, d = ti.static((at.group, at.grid.dimension))
+    N = ti.Vector.zero(float, d)
+    for c in ti.static(range(d)):
+        N[c] = group.carried[p][c]
+    n = (ti.Matrix.identity(float, d) + dt * slope).inverse().transpose() @ N
+    for c in ti.static(range(d)):
+        group.carried[p][c] = n[c] / n.norm()
+    group.carried[p][d] /= n.norm()

@@ -61,21 +61,21 @@ def update_rows(at: ti.template(), first: int, last: int, gravity_step: ti.templ
 
 
 @ti.func
-def nodes_of_rows(at: ti.template(), first: int, last: int, kick: float):
+def nodes_of_rows(at: ti.template(), first: int, last: int, time: float):
     """Apply the function of a phase to each node in rows first to last - 1 of the box in use."""
     for row in range(first, last):
         node = at.grid.row_start(row)
         count = at.grid.row_length(node)
-        if ti.static(at.wanted):
-            if not ti.static(at.wanted)(at, node):
+        if ti.static(at.phase.wanted):
+            if not ti.static(at.phase.wanted)(at, node):
                 count = 0
         for _ in range(count):
-            ti.static(at.item)(at, node, kick)
+            ti.static(at.phase.body)(at, node, time)
             node[ti.static(at.grid.dimension - 1)] += 1
 
 
 @ti.func
-def nodes_of_blocks(at: ti.template(), first: int, after: int, kick: float):
+def nodes_of_blocks(at: ti.template(), first: int, after: int, time: float):
     """Apply the function of a phase to each node of blocks `first` to `after` - 1."""
     grid, d = ti.static((at.grid, at.grid.dimension))
     for b in range(first, after):
@@ -85,7 +85,7 @@ def nodes_of_blocks(at: ti.template(), first: int, after: int, kick: float):
             for a in ti.static(range(d)):
                 along = q // ti.static(grid.tile ** (d - 1 - a)) % ti.static(grid.tile)
                 node[a] = place[a] * ti.static(grid.tile) + along
-            ti.static(at.item)(at, node, kick)
+            ti.static(at.phase.body)(at, node, time)
 
 
 @ti.func

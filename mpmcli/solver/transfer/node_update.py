@@ -4,7 +4,7 @@ from copy import copy
 
 from mpmcli.boundaries.colliders import Colliders
 from mpmcli.boundaries.mirror_images import MirrorImages
-from mpmcli.boundaries.walls import REACH
+from mpmcli.boundaries.walls import IMAGE_DEPTH
 from mpmcli.quick_taichi import ti
 from mpmcli.solver.contact.collider_points import ColliderPoints
 from mpmcli.solver.grid.grid import Grid
@@ -69,12 +69,13 @@ class NodeUpdate:
 
     @ti.func
     def update_massive(self, node: ti.template(), index: int, gravity_step: ti.template()):
+        """Fold, divide by mass, constrain and unfold a node with mass, and return its squared speed, see `update`."""
         d = ti.static(self.dimension)
         value = self.grid.part(index, 0)
         pull = gravity_step
         speed_squared = 0.0
         # Computed once for all uses below, because the code that depends on these values is most of this loop.
-        depth, mirror, upper = ti.Vector([REACH + 1] * d), node, ti.Vector.zero(int, d)
+        depth, mirror, upper = ti.Vector([IMAGE_DEPTH + 1] * d), node, ti.Vector.zero(int, d)
         acts, holds = ti.Vector.zero(int, d), ti.Vector.zero(int, d)
         place = ti.static((depth, mirror, upper, acts, holds))
 

@@ -37,12 +37,12 @@ class Sender:
     inner: Any
     row: Any
     constants: Any
-    loads: "Loads"
+    loads: "ExternalLoads"
     borne: Any
 
 
 @dataclass(frozen=True)
-class Loads:
+class ExternalLoads:
     """External loads on a particle: variables of a kernel, zero for loads that the scene does not have.
 
     Attributes:

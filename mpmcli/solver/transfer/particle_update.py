@@ -1,4 +1,4 @@
-"""What particles meet in a step, and how they relax, move and are lost."""
+"""What particles meet in a step, and how they move and are lost."""
 
 from collections.abc import Sequence
 from copy import copy
@@ -11,19 +11,17 @@ from mpmcli.solver.contact.total_solids import ParticleContact
 from mpmcli.solver.grid.grid import Grid, LinearNodes
 from mpmcli.solver.grid.period import opaque
 from mpmcli.solver.particles.arrays import ParticleArrays
-from mpmcli.solver.particles.state_bounds import deformation_rate
-from mpmcli.solver.transfer.volume import level_volume, relax_volume
 from mpmcli.stability.limits import OVERLAP
 
 NOT_LOST = 2**31 - 1
 # Largest distance beyond an open face, cells, at which particles wait for the next sort to retire them; nodes extend so
 # far.
-BEYOND = 1.99
+OPEN_MARGIN = 1.99
 
 
 @ti.data_oriented
 class ParticleUpdate:
-    """What particles meet in a step (see `scatter` and `advance`), and how they relax, move and are lost.
+    """What particles meet in a step (see `scatter` and `advance`), and how they move and are lost.
 
     Attributes:
         near: the nodes that stencils address: those of the grid, or on a sparse grid those of a window.
@@ -50,6 +48,7 @@ class ParticleUpdate:
         *,
         watches_box: bool,
     ) -> None:
+        """Store what particles meet, and allocate the record of lost particles of `group_count` groups."""
         self.repulsion, self.repels, self.friction, self.moving = repulsion, repulsion is not None, friction, moving
         self.grid = self.near = grid
         self.dimension, self.run, self.first_lost = grid.dimension, 0, 0
@@ -71,19 +70,6 @@ class ParticleUpdate:
         return result
 
     @ti.func
-    def relax(self, g: ti.template(), group: ti.template(), p: int, relaxed: float):
-        """Relax the volume of one particle over a time, s, after P2G; return the absolute change of its logarithm."""
-        change = 0.0
-        _v, C = group.motion(p)
-        # A particle at rest is not relaxed.
-        if deformation_rate(group, C) > 0.0:
-            if ti.static(group.levels):
-                change = level_volume(self.grid, g, group, p)
-            else:
-                change = relax_volume(group, self.grid, p, group.x[p], relaxed)
-        return change
-
-    @ti.func
     def lose(self, g: ti.template(), group: ti.template(), p: int):
         if ti.static(self.grid.deterministic):
             ti.atomic_min(self.lost[self.first_lost + g], group.id[p])
@@ -97,7 +83,7 @@ class ParticleUpdate:
         would lose what they have stored if particles stopped at it.
         """
         springs = group.surfaced and self.faces[axis][side] in SEPARATING
-        return BEYOND if self.faces[axis][side] == OPEN else OVERLAP * springs
+        return OPEN_MARGIN if self.faces[axis][side] == OPEN else OVERLAP * springs
 
     @ti.func
     def moved(self, group: ti.template(), x: ti.template(), remainder: ti.template(), v: ti.template(), dt: float):

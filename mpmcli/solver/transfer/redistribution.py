@@ -10,7 +10,6 @@ The functions below are the bodies of the phases of a shift, each for one node o
 CPU or an `Item` on a GPU; `time` is the time since the last shift, s.
 """
 
-import math
 from collections.abc import Sequence
 
 from mpmcli.materials.fluid import shear_rate
@@ -18,20 +17,16 @@ from mpmcli.materials.law import Law
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
 from mpmcli.scene.sampling import points_per_cell
-from mpmcli.solver.grid.grid import Grid, LinearNodes
-from mpmcli.solver.grid.sparse_grid import BlockNodes, SparseGrid
+from mpmcli.solver.grid.fine_grid import FineGrid
 from mpmcli.solver.particles.arrays import MASS, VOLUME
 from mpmcli.solver.particles.loop import STENCIL, Operation, Pass
-from mpmcli.solver.transfer.splines import PAD, SPLINES, TransferScheme
-from mpmcli.solver.transfer.stencils import add_linear, gather_linear, node_of, origin_of
+from mpmcli.solver.transfer.stencils import add_linear, gather_linear
 from mpmcli.stability.transfer_factors import FARTHEST
 
 # Factor s of the strain e since the last shift: a particle moves by s e / (1 + s e) of the gradient of the crowding.
 PUSH = 8.0
 # Excess of the filling over 1 below which it counts less: that of rows of a lattice stretched twice.
 MILD = 0.5
-# Bound on a displacement in the sums in fixed point, cells.
-LARGEST_WAY = 4.0
 
 
 def fine_nodes(scene: Scene, laws: Sequence[Law]) -> int:
@@ -44,54 +39,9 @@ def fine_nodes(scene: Scene, laws: Sequence[Law]) -> int:
     return max((max(1, round(count ** (1 / scene.dimension))) for count in counts), default=0)
 
 
-def farthest_shift(fine: "FineGrid | None") -> float:
+def farthest_shift(fine: FineGrid | None) -> float:
     """Return the largest displacement of a particle by a shift and the subtraction of its mean, cells."""
     return 2 * FARTHEST / fine.per_cell if fine else 0.0
-
-
-@ti.data_oriented
-class FineGrid(LinearNodes):
-    """Nodes about as far apart as particles, `per_cell` per cell of a grid along each axis.
-
-    Attributes:
-        per_cell: nodes per cell along an axis.
-        in_cell: nodes per cell.
-        fill: Vector(1) field: the filled fraction of each fine cell; after `fold_fine` the crowding phi.
-    """
-
-    width = 1
-
-    def __init__(self, grid: Grid, per_cell: int) -> None:
-        self.dimension, self.per_cell, self.runs, self.first_node = grid.dimension, per_cell, grid.runs, 0
-        self.in_cell = per_cell**self.dimension
-        self.scheme, self.planes = TransferScheme(SPLINES["quadratic"]), 3 if self.dimension == 3 else 1
-        self.strides = tuple(math.prod(per_cell * n for n in grid.shape[a + 1 :]) for a in range(self.dimension))
-        self.node_count = self.in_cell * grid.node_count
-        self.fill = ti.Vector.field(1, float, shape=self.runs * self.node_count)
-
-    @ti.func
-    def place_in_cell(self, node: ti.template(), q: int):
-        """Return the integer coordinates of the q-th fine node in the cell whose first node is `node`."""
-        place = node * self.per_cell
-        for a in ti.static(range(self.dimension)):
-            place[a] += q // ti.static(self.per_cell ** (self.dimension - 1 - a)) % self.per_cell
-        return place
-
-    @ti.func
-    def stencil(self, x: ti.template(), inverse_spacing: float):
-        """Return the first node of the stencil of a point and the distance from it, given the 1/h of the grid."""
-        base, distance = self.scheme.spline.stencil(x, inverse_spacing * self.per_cell)
-        return base + ti.static(PAD * (self.per_cell - 1)), distance
-
-
-@ti.data_oriented
-class FineBlocks(BlockNodes, FineGrid):
-    """The fine nodes of a sparse grid: a block stores the fine nodes of its cells."""
-
-    def __init__(self, grid: SparseGrid, per_cell: int) -> None:
-        super().__init__(grid, per_cell)
-        self.tile, self.tiles, self.table = per_cell * grid.tile, grid.tiles, grid.table
-        self.block = self.tile**self.dimension
 
 
 @ti.func
@@ -99,10 +49,7 @@ def clear_fine(at: ti.template(), node: ti.template(), time: float):
     """Clear a node and the fine nodes of its cell."""
     at.grid.clear(at.grid.linear_index(node))
     for q in range(ti.static(at.grid.fine.in_cell)):
-        index = at.grid.fine.linear_index(at.grid.fine.place_in_cell(node, q))
-        at.grid.fine.fill[index][0] = 0.0
-        if ti.static(at.grid.deterministic):
-            at.grid.fixed.fine.clear(index)
+        at.grid.fine.clear(at.grid.fine.linear_index(at.grid.fine.place_in_cell(node, q)))
 
 
 @ti.func
@@ -117,12 +64,7 @@ def fill_fine(at: ti.template(), p: int, time: float):
     volume = ti.min(volume, 1.0)
     w = fine.scheme.spline.weights(distance)
     even = ti.Matrix.zero(float, fine.dimension, 1)
-    first = fine.stencil_at(base)
-    if ti.static(at.grid.deterministic):
-        scaled = ti.Vector([volume * ti.static(at.grid.fixed.of_fine)])
-        add_linear(at.grid.fixed.fine, fine, first, w, scaled, even, at.atomic)
-    else:
-        add_linear(fine.fill, fine, first, w, ti.Vector([volume]), even, at.atomic)
+    add_linear(fine.sums, fine, fine.stencil_at(base), w, ti.Vector([volume * fine.scale]), even, at.atomic)
 
 
 @ti.func
@@ -130,7 +72,7 @@ def fine_to_float(at: ti.template(), node: ti.template(), time: float):
     """Convert the sums of the fine nodes from fixed point."""
     for q in range(ti.static(at.grid.fine.in_cell)):
         index = at.grid.fine.linear_index(at.grid.fine.place_in_cell(node, q))
-        at.grid.fine.fill[index][0] = at.grid.fixed.fine.value(index)[0] / ti.static(at.grid.fixed.of_fine)
+        at.grid.fine.fill[index][0] = at.grid.fine.sums.value(index)[0] / at.grid.fine.scale
 
 
 @ti.func
@@ -246,11 +188,11 @@ def slope_of(fine: ti.template(), first: ti.template(), w: ti.template(), distan
     """Return the gradient of `FineGrid.fill` per fine cell, the sum of fill_j grad w_j over a stencil."""
     d = ti.static(fine.dimension)
     slopes = ti.Matrix.rows([distance - 1.5, 2.0 - 2.0 * distance, distance - 0.5])
-    result, origin = ti.Vector.zero(float, d), origin_of(first, fine)
+    result, origin = ti.Vector.zero(float, d), fine.origin_of(first)
     for i, j in ti.static(ti.ndrange(fine.planes, 3)):
         total, slope = 0.0, 0.0
         for k in ti.static(range(3)):
-            fill = fine.fill[node_of(origin, fine, i, j, k)][0]
+            fill = fine.fill[fine.node_of(origin, i, j, k)][0]
             total += w[k, d - 1] * fill
             slope += slopes[k, d - 1] * fill
         if ti.static(d == 3):
@@ -280,20 +222,14 @@ def add_shift(
     """
     grid, d = ti.static((at.grid, at.grid.dimension))
     value, change = ti.Vector.zero(float, grid.width), ti.Matrix.zero(float, d, grid.width)
-    scale = mass
-    if ti.static(grid.deterministic):
-        # Convert to a speed within the range of the sums.
-        scale *= grid.fixed.pace[grid.fixed.run][2] * ti.static(1.0 / LARGEST_WAY) * grid.inverse_spacing
+    scale = mass * grid.way_scale()
     for c in ti.static(range(d)):
         value[c] = scale * way[c]
         for a in ti.static(range(d)):
             change[a, c] = scale * slope[a, c]
     value[d] = mass
-    if ti.static(grid.deterministic):
-        if grid.fixed.scaled(mass, value, change):
-            add_linear(grid.fixed.nodes, grid, first, w, value, change, at.atomic)
-    else:
-        add_linear(grid.nodes, grid, first, w, value, change, at.atomic)
+    if grid.scaled(mass, value, change):
+        add_linear(grid.sums, grid, first, w, value, change, at.atomic)
 
 
 @ti.func
@@ -303,7 +239,7 @@ def shift_to_float(at: ti.template(), node: ti.template(), time: float):
     index = grid.linear_index(node)
     grid.fixed.to_float(grid, index, 0.0)
     for a in ti.static(range(grid.dimension)):
-        grid.nodes[index][a] *= LARGEST_WAY * grid.spacing / grid.fixed.pace[grid.fixed.run][2]
+        grid.nodes[index][a] *= grid.fixed.largest_way(grid.spacing)
 
 
 @ti.func

@@ -2,11 +2,11 @@
 
 from mpmcli.quick_taichi import ti
 from mpmcli.solver.contact.total_solids import friction_of_walls
-from mpmcli.solver.particles.arrays import CONSTANTS, MASS, VOLUME, ParticleArrays
+from mpmcli.solver.particles.arrays import MASS, VOLUME, ParticleArrays, constants_of
 from mpmcli.solver.particles.loop import Operation, Pass
 from mpmcli.solver.particles.state_bounds import SMALLEST_J, volume_ratio
 from mpmcli.solver.transfer.advance import LOCATE
-from mpmcli.solver.transfer.particle_step import Loads, Sender, p2g
+from mpmcli.solver.transfer.particle_step import ExternalLoads, Sender, p2g
 from mpmcli.solver.transfer.run_sums import RunSums, move_to
 from mpmcli.solver.transfer.stencils import add_linear
 from mpmcli.solver.transfer.volume import in_layer, missing_to_mean
@@ -37,6 +37,7 @@ def scatter_of(group: ParticleArrays, *, keeps: bool, repels: bool) -> Operation
             Pass(add),
         ),
         guarded=writes,
+        near=True,
     )
 
 
@@ -101,12 +102,9 @@ def send(
 
     The stress of a crushed particle would spread NaN over the grid.
     """
-    group, d = ti.static((at.group, at.group.dimension))
-    state = 1.0 + deformation
-    if ti.static(group.law.deformation == "F"):
-        state = ti.Matrix.identity(float, d) + deformation
-    constants = ti.Vector([row[CONSTANTS + c] for c in ti.static(range(row.n - CONSTANTS))])
-    (loads,) = ti.static((Loads(share, missing, push, slope, touch, friction),))
+    (group,) = ti.static((at.group,))
+    state, constants = group.whole(deformation), constants_of(row)
+    (loads,) = ti.static((ExternalLoads(share, missing, push, slope, touch, friction),))
     (own,) = ti.static((Sender(place, x, v, C, state, inner, row, constants, loads, borne),))
     middle, change, plastic, inner_after = p2g(at.particles, group, own, apart, kick)
     after = deformation
@@ -134,13 +132,10 @@ def add(
         if ti.static(isinstance(at.sums, RunSums)):
             move_to(at.sums, node)
             add_linear(at.sums, near, node, w, middle, change, False)
-        elif ti.static(grid.deterministic):
-            if grid.fixed.scaled(group.row(p)[MASS], middle, change):
-                add_linear(grid.fixed.nodes, near, node, w, middle, change, True)
-            else:
-                grid.fixed.note(group.id[p])
+        elif near.scaled(group.row(p)[MASS], middle, change):
+            add_linear(near.sums, near, node, w, middle, change, at.atomic)
         else:
-            add_linear(near.nodes, near, node, w, middle, change, at.atomic)
+            near.note(group.id[p])
     if ti.static(grid.keeps_filling):
         if at.step.relaxed > 0.0:
             scatter_volume(group.x[p], group.row(p)[VOLUME], near, at.atomic)
@@ -152,10 +147,6 @@ def scatter_volume(x: ti.template(), volume: float, grid: ti.template(), atomic:
     base, distance = grid.scheme.spline.stencil(x, grid.inverse_spacing)
     w = grid.scheme.spline.weights(distance)
     middle = ti.Vector.zero(float, grid.filling.n)
-    middle[ti.static(grid.dimension)] = volume
+    middle[ti.static(grid.dimension)] = volume * grid.volume_scale()
     change = ti.Matrix.zero(float, ti.static(grid.dimension), grid.filling.n)
-    if ti.static(grid.deterministic):
-        middle[ti.static(grid.dimension)] = volume * grid.fixed.volume_scale()
-        add_linear(grid.fixed.filling, grid, grid.linear_index(base), w, middle, change, atomic)
-    else:
-        add_linear(grid.filling, grid, grid.linear_index(base), w, middle, change, atomic)
+    add_linear(grid.volume_sums, grid, grid.linear_index(base), w, middle, change, atomic)

@@ -8,7 +8,6 @@ has one more node, at 2. On the CPU every node is four numbers wide, which the c
 from mpmcli.quick_taichi import ti
 from mpmcli.solver.grid.fixed_point import FixedSums
 from mpmcli.solver.transfer.run_sums import RunSums
-from mpmcli.solver.transfer.splines import LOW_BITS, bounded
 
 
 @ti.func
@@ -31,7 +30,7 @@ def add_linear(
         change: its change per cell, a row per axis.
     """
     d, width = ti.static((grid.dimension, middle.n))
-    origin = origin_of(first, grid)
+    origin = grid.origin_of(first)
     for i in ti.static(range(grid.planes)):
         # The quantity at the middle of a plane and its changes along the other axes, weighted along the first axis.
         plane, across, along = middle, ti.Vector.zero(float, width), ti.Vector.zero(float, width)
@@ -53,24 +52,6 @@ def add_linear(
             put(field, origin, grid, (i, j, 2), (line + step) * w[2, d - 1], atomic)
             if ti.static(grid.scheme.spline.nodes == 4):
                 put(field, origin, grid, (i, j, 3), (line + 2.0 * step) * w[3, d - 1], atomic)
-
-
-@ti.func
-def origin_of(first: ti.template(), grid: ti.template()):
-    """Return `stencil_at` of the first node of a stencil, `bounded` if a dense grid has at most LOW_BITS nodes."""
-    if ti.static(not grid.sparse and grid.runs * grid.layers * grid.node_count <= LOW_BITS):
-        return bounded(first)
-    else:
-        return first
-
-
-@ti.func
-def node_of(origin: ti.template(), grid: ti.template(), i: ti.template(), j: ti.template(), k: ti.template()):
-    """Return the linear index of node k of line j in plane i of a stencil."""
-    if ti.static(grid.sparse):
-        return grid.node_of(origin, i, j, k)
-    else:
-        return origin + ti.static(grid.line_node(i, j) + k)
 
 
 @ti.func
@@ -118,7 +99,7 @@ def put(
         for c in ti.static(range(share.n)):
             field.sums[ti.static(field.row(at)), c] += share[c]
     else:
-        add(field, node_of(origin, grid, at[0], at[1], at[2]), share, atomic)
+        add(field, grid.node_of(origin, at[0], at[1], at[2]), share, atomic)
 
 
 @ti.func
@@ -139,7 +120,7 @@ def gather_linear(field: ti.template(), grid: ti.template(), first: ti.template(
     Offsets are measured from the middle node.
     """
     d, width = ti.static((grid.dimension, field.n))
-    origin = origin_of(first, grid)
+    origin = grid.origin_of(first)
     velocity = ti.Vector.zero(float, width)
     moment = ti.Matrix.zero(float, d, width)
     for i in ti.static(range(grid.planes)):
@@ -148,12 +129,12 @@ def gather_linear(field: ti.template(), grid: ti.template(), first: ti.template(
         across = ti.Vector.zero(float, width)
         along = ti.Vector.zero(float, width)
         for j in ti.static(range(grid.scheme.spline.nodes)):
-            low = field[node_of(origin, grid, i, j, 0)] * w[0, d - 1]
-            mid = field[node_of(origin, grid, i, j, 1)] * w[1, d - 1]
-            high = field[node_of(origin, grid, i, j, 2)] * w[2, d - 1]
+            low = field[grid.node_of(origin, i, j, 0)] * w[0, d - 1]
+            mid = field[grid.node_of(origin, i, j, 1)] * w[1, d - 1]
+            high = field[grid.node_of(origin, i, j, 2)] * w[2, d - 1]
             total, slope = (low + high) + mid, high - low
             if ti.static(grid.scheme.spline.nodes == 4):
-                far = field[node_of(origin, grid, i, j, 3)] * w[3, d - 1]
+                far = field[grid.node_of(origin, i, j, 3)] * w[3, d - 1]
                 total += far
                 slope += 2.0 * far
             total *= w[j, d - 2]

@@ -24,7 +24,7 @@ from mpmcli.scene.schema import SolverSettings
 from mpmcli.solver.contact.layers import Layers
 from mpmcli.solver.particles.arrays import MASS, VOLUME
 from mpmcli.solver.particles.loop import INDEX, Operation, Pass, over
-from mpmcli.solver.particles.state_bounds import volume_ratio
+from mpmcli.solver.particles.state_bounds import deformation_rate, volume_ratio
 from mpmcli.solver.transfer.splines import PAD
 
 # Lack of volume that is ignored where a collider cuts the kernel, beside what a law ignores. The density of particles
@@ -60,10 +60,7 @@ def cell_of(grid: ti.template(), x: ti.template()):
 @ti.func
 def in_layer(grid: ti.template(), group: ti.template(), p: int, cell: int):
     """Return the index of a cell in the layer of the body of particle p, given that in layer 0."""
-    index = cell
-    if ti.static(group.layers > 1):
-        index += group.layer_of(p) * ti.static(grid.node_count)
-    return index
+    return cell + group.layer_of(p) * grid.node_count
 
 
 @ti.func
@@ -90,9 +87,9 @@ def add_volume(at: ti.template(), p: int, dt: float, log_J: float, cell: int):
     (group,) = ti.static((at.group,))
     volume, own = group.row(p)[VOLUME], in_layer(at.grid, group, p, cell)
     group.cell[p], group.to_mean[p] = own, log_J
-    add_to_mean(at, own, 0, volume, log_J)
+    at.grid.add_mean(at.g, own, 0, volume, log_J, at.atomic)
     if ti.static(group.evened):
-        add_to_mean(at, earlier_cell(at.grid, group, p, dt), 2, volume, group.growth[p])
+        at.grid.add_mean(at.g, earlier_cell(at.grid, group, p, dt), 2, volume, group.growth[p], at.atomic)
 
 
 # Adds particles to the sums of their cells, which no other thread may write unless sums are atomic.
@@ -103,56 +100,26 @@ AVERAGE = Operation(
 
 
 @ti.func
-def add_to_mean(at: ti.template(), cell: int, first: ti.template(), volume: float, value: float):
-    """Add a value times the volume of a particle, and the volume, to two sums of a cell."""
-    if ti.static(at.grid.deterministic):
-        at.grid.fixed.add_mean(at.g, cell, first, volume, value)
-    elif ti.static(at.atomic):
-        ti.atomic_add(at.grid.means[at.g][cell][first], volume * value)
-        ti.atomic_add(at.grid.means[at.g][cell][ti.static(first + 1)], volume)
-    else:
-        more = ti.Vector.zero(float, 4)
-        more[first], more[ti.static(first + 1)] = value, 1.0
-        at.grid.means[at.g][cell] = at.grid.means[at.g][cell] + volume * more
-
-
-@ti.func
 def clear_mean(grid: ti.template(), g: ti.template(), group: ti.template(), p: int):
     """Set the sums of the cell of particle p and of its periodic images to zero."""
     cell = in_layer(grid, group, p, cell_of(grid, group.on_grid(p)))
-    clear_cell(grid, g, cell)
+    grid.clear_mean(g, cell)
     if ti.static(len(grid.images.periodic) > 0):
         for images in range(1, ti.static(grid.images.by_period.sets)):
-            image, exists = grid.images.by_period.image(grid.place_of(cell), images, 1)
+            image, exists = grid.images.by_period.image(grid.node_at(cell), images, 1)
             if exists:
-                clear_cell(grid, g, grid.linear_index(image))
-
-
-@ti.func
-def clear_cell(grid: ti.template(), g: ti.template(), cell: int):
-    if ti.static(grid.deterministic):
-        grid.fixed.means[g].clear(cell)
-    else:
-        grid.means[g][cell] = ti.Vector.zero(float, 4)
-
-
-@ti.func
-def sums_at(grid: ti.template(), g: ti.template(), cell: int):
-    if ti.static(grid.deterministic):
-        return grid.fixed.mean(g, cell)
-    else:
-        return grid.means[g][cell]
+                grid.clear_mean(g, grid.linear_index(image))
 
 
 @ti.func
 def sums_of_cell(grid: ti.template(), g: ti.template(), cell: int):
     """Return the sums over a cell and its periodic images, after all particles were added."""
-    sums = sums_at(grid, g, cell)
+    sums = grid.mean(g, cell)
     if ti.static(len(grid.images.periodic) > 0):
         for images in range(1, ti.static(grid.images.by_period.sets)):
-            image, exists = grid.images.by_period.image(grid.place_of(cell), images, 1)
+            image, exists = grid.images.by_period.image(grid.node_at(cell), images, 1)
             if exists:
-                more = sums_at(grid, g, grid.linear_index(image))
+                more = grid.mean(g, grid.linear_index(image))
                 for k in ti.static(range(4)):
                     sums[k] += more[k]
     return sums
@@ -202,6 +169,22 @@ def needs_filling(scene: Scene, laws: Sequence[Law], layers: Layers) -> bool:
     """
     alike = len({body.material.density for body in scene.sources}) == 1 and layers.count == 1
     return any(law.relaxes for law in laws) and (layers.by_points or not alike)
+
+
+@ti.func
+def change_volume(at: ti.template(), p: int, relaxed: float, C: ti.template()):
+    """Relax the volume of a particle over a time, s, after P2G; return the absolute change of its logarithm."""
+    change = 0.0
+    # A particle at rest is not relaxed.
+    if deformation_rate(at.group, C) > 0.0:
+        if ti.static(at.group.levels):
+            change = level_volume(at.grid, at.g, at.group, p)
+        else:
+            change = relax_volume(at.group, at.grid, p, at.group.x[p], relaxed)
+    return change
+
+
+RELAX = Operation(reads=("C",), passes=(Pass(change_volume, {"change": ()}),), largest="change")
 
 
 @ti.func

@@ -118,6 +118,7 @@ class Bar(Case):
         )
 
     def measure(self, n: int, scene: Scene, frames: Frames) -> dict[str, float]:
+        """Return errors of the period, damping and amplitude of the mode, fitted to its projection over time."""
         times, signal, steps = [], [], 0
         for frame, row in frames:
             X = field(frame, "initial_position")[:, 0]
@@ -180,6 +181,7 @@ class Galilean(Case):
         return body(name, BAR, box(low, [low[0] + LENGTH, low[1] + HEIGHT * h]), velocity=velocity)
 
     def measure(self, n: int, scene: Scene, frames: Frames) -> dict[str, float]:
+        """Return the error of the period of the rod in flight, its change by flight, and the losses of both rods."""
         times: list[float] = []
         signals: tuple[list[float], list[float]] = ([], [])
         for frame, _ in frames:

@@ -41,6 +41,7 @@ class Beam:
         return self._shoot(moment)
 
     def _shoot(self, moment: float) -> "OdeSolution":
+        """Return x, y, theta and the moment along the beam, s from 0 at the clamp to 1, for a moment at the clamp."""
         from scipy.integrate import solve_ivp
 
         def slopes(s: float, state: np.ndarray) -> tuple[float, ...]:
@@ -89,6 +90,7 @@ class Cantilever(Case):
         return Beam(self.load, SPREAD, axial=12 * SLENDERNESS**2, shear=5 * SLENDERNESS**2)
 
     def tables(self, n: int) -> Tables:
+        """Return a beam n cells thick, whose load near the tip grows over RAMP periods and stays for WINDOW."""
         # P / (density thickness length of the loaded part), m/s^2.
         pull = self.load * YOUNG * THICKNESS**2 / (12 * LENGTH**2) / (DENSITY * SPREAD * LENGTH)
         load = f"-{pull!r} * {smooth_ramp(RAMP * PERIOD)} if X > {(1 - SPREAD) * LENGTH!r} else 0"
@@ -106,6 +108,7 @@ class Cantilever(Case):
         )
 
     def measure(self, n: int, scene: Scene, frames: Frames) -> dict[str, float]:
+        """Return the error of the mean place of the tip, over its way, and the deflection against a thin beam's."""
         tip = np.zeros(2)
         for weight, frame in after_ramp(frames, RAMP * FRAMES_PER_PERIOD, WINDOW * FRAMES_PER_PERIOD):
             along = field(frame, "initial_position")[:, 0]

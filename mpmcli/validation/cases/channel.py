@@ -66,6 +66,7 @@ class Channel(Case):
     known: Callable[[np.ndarray, float], np.ndarray]
 
     def tables(self, n: int) -> Tables:
+        """Return a channel of n cells of width, and a block of fluid in it that gravity pulls along the walls."""
         h = WIDTH / n
         return problem(
             {
@@ -81,6 +82,7 @@ class Channel(Case):
         )
 
     def measure(self, n: int, scene: Scene, frames: Frames) -> dict[str, float]:
+        """Return errors of velocity and flow, and the flow across, in the middle of the block at the end."""
         *_, (last, row) = frames
         X = field(last, "initial_position")
         start, end = (bound[0] for bound in scene.bodies[0].shape.form.bounds())
@@ -150,6 +152,7 @@ class Couette(Case):
     )
 
     def tables(self, n: int) -> Tables:
+        """Return a periodic channel of n cells of width, whose upper wall moves along itself."""
         length = PERIODIC * WIDTH / n
         return problem(
             {

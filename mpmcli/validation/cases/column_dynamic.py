@@ -61,6 +61,7 @@ class ColumnDynamic(Case):
         return problem(domain, time, "stress initial_position", [column])
 
     def measure(self, n: int, scene: Scene, frames: Frames) -> dict[str, float]:
+        """Return errors of the stress at the base over time, of the first peak of the top and of the period."""
         times, tops, modes, errors = [], [], [], []
         for frame, _ in frames:
             start = field(frame, "initial_position")[:, 1]

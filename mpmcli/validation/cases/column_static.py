@@ -62,6 +62,7 @@ class WeightedColumn(Case):
         return problem(domain, time, "stress initial_position", [column])
 
     def measure(self, n: int, scene: Scene, frames: Frames) -> dict[str, float]:
+        """Return errors of stress and settlement, of means over the window after the load has grown."""
         stress = height = 0.0
         for weight, frame in after_ramp(frames, RAMP * FRAMES_PER_PERIOD, WINDOW * FRAMES_PER_PERIOD):
             stress = stress + weight * field(frame, "stress").reshape(-1, 3, 3)[:, 1, 1]

@@ -36,6 +36,7 @@ class Conservation(Case):
     varies = ("precision", "kernel", "transfer")
 
     def __init__(self, name: str, title: str, dimension: int, levels: Levels) -> None:
+        """Set measures with their bounds, the end, s, and the exact mass, kg, for a dimension."""
         self.name, self.title, self.dimension, self.levels = name, title, dimension, levels
         # Shorter waves in the bodies are damped first.
         loss = (lambda n: 0.2 * (8 / n) ** 0.45) if dimension == 2 else 0.11
@@ -52,6 +53,7 @@ class Conservation(Case):
         self.mass = DENSITY * (EDGE**dimension + volume)
 
     def tables(self, n: int) -> Tables:
+        """Return the block, of n cells per edge, and the ball; they drift, spin and stretch in opposite senses."""
         d = self.dimension
         across = [1.5 * EDGE] * (d - 1)
         centre = [1.5 * EDGE, *across]
@@ -67,6 +69,7 @@ class Conservation(Case):
         return problem(domain, (self.end, FRAMES), "velocity mass", bodies)
 
     def measure(self, n: int, scene: Scene, frames: Frames) -> dict[str, float]:
+        """Return the largest changes of momenta, over sums of magnitudes, and of mass, and energy gained and lost."""
         origin = np.array(scene.domain.origin)
         rows = []
         momentum = moment = 0.0

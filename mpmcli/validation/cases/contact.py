@@ -29,6 +29,7 @@ class SlidingBlock(Case):
     )
 
     def tables(self, n: int) -> Tables:
+        """Return a block of n cells of height, compressed by its weight, that slides on a floor with friction."""
         block = body(
             "block",
             # With nu = 0 the weight causes one-dimensional compression, which is the initial state.
@@ -84,6 +85,7 @@ class SlopeContact(Case):
     degrees, friction, height = 30.0, 0.3, 0.25
 
     def tables(self, n: int) -> Tables:
+        """Return a block on a base, n cells high, both off nodes, in gravity tilted by `degrees`."""
         h = self.height / n
         off, edge = 0.3 * h, self.height
         top = edge + off

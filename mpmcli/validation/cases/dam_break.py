@@ -89,6 +89,7 @@ class DamBreak(Case):
         )
 
     def measure(self, n: int, scene: Scene, frames: Frames) -> dict[str, float]:
+        """Return errors of front and height against the measured curves, in units of the column and its time."""
         times, fronts, heights = [], [], []
         for frame, _ in frames:
             x, y = frame.position.astype(np.float64).T
@@ -125,7 +126,7 @@ MIDDLE = 0.5
 # Height at which the water has arrived at a gauge, m. A dry gauge reads up to 1.5 mm.
 WET = 0.01
 # Half the width of the columns in which the water of a simulation is measured, m.
-REACH = 1 / 16
+HALF_WIDTH = 1 / 16
 # Face of the obstacle that the front hits, m; speed of the front, m/s, from its times at x = 1.488 and 0.992 m; time of
 # impact, s.
 FACE = 0.8245
@@ -157,7 +158,7 @@ def measured_gauges() -> dict[str, Gauge]:
     return {row["name"]: Gauge(row["x"], row["arrival"], time, np.array(row["height"])) for row in tables["gauge"]}
 
 
-def water_height(position: np.ndarray, x: float, volume: float, reach: float = REACH) -> float:
+def water_height(position: np.ndarray, x: float, volume: float, reach: float = HALF_WIDTH) -> float:
     """Return the height of the water in a column, m: volume over area, so that a single drop contributes little.
 
     The weight of a particle is a hat function along both axes, 1 at the gauge and 0 at the distance `reach`, m, so that
@@ -204,6 +205,7 @@ class DamBreakObstacle(Case):
     varies = ("precision",)
 
     def tables(self, n: int) -> Tables:
+        """Return the tank, n cells wide, with the water behind the gate and the obstacle."""
         h = WIDTH / n
         along, up = math.ceil(LENGTH / h - 1e-9), math.ceil(HEIGHT / h - 1e-9)
         column = box([DAM, 0.0, 0.0], [LENGTH, WIDTH, DEPTH])
@@ -224,6 +226,7 @@ class DamBreakObstacle(Case):
         )
 
     def measure(self, n: int, scene: Scene, frames: Frames) -> dict[str, float]:
+        """Return errors of heights, arrivals, s, and impact, s, the force, and how deep water enters the obstacle."""
         gauges = {name: measured_gauges()[name] for name in GAUGES}
         times, fronts, forces, heights, deepest = [], [], [], [], 0.0
         for frame, row in frames:

@@ -59,6 +59,7 @@ class SandColumn(Case):
         )
 
     def tables(self, n: int) -> Tables:
+        """Return half of a column, n cells wide, between a plane of symmetry and a rough floor."""
         h = L0 / n
         across, up = (2 + math.ceil(self.runout[1])) * n, self.aspect * n + 4
         height = self.aspect * L0
@@ -78,6 +79,7 @@ class SandColumn(Case):
         )
 
     def measure(self, n: int, scene: Scene, frames: Frames) -> dict[str, float]:
+        """Return run-out and height at the end, against bands of experiments and refined runs, and the speed left."""
         for frame, _ in frames:
             position, speed = frame.position, np.linalg.norm(frame.velocity.astype(np.float64), axis=1)
         reach, top = np.quantile(position.astype(np.float64), 0.99, axis=0) / L0
@@ -104,7 +106,7 @@ SQUEEZE = -1e-3
 # Final shear strain; the sand yields from K |SQUEEZE| sin(phi) / (2 mu), about half of a thousandth, on.
 SHEAR = 3e-3
 # Distance that a wave travels from the faces until the end, and width of the middle, relative to the size.
-REACH, MIDDLE = 0.2, 0.2
+WAVE_PATH, MIDDLE = 0.2, 0.2
 
 
 class SandShear(Case):
@@ -124,7 +126,7 @@ class SandShear(Case):
     )
 
     def tables(self, n: int) -> Tables:
-        end = REACH * SIZE / WAVE_SPEED
+        end = WAVE_PATH * SIZE / WAVE_SPEED
         rate, stretch = SHEAR / end, math.exp(SQUEEZE / 2)
         domain, (shape,) = free_blocks(n, SIZE, 1, (4, 4))
         material = elastic("sand", DENSITY, YOUNG, NU, friction_angle=FRICTION, friction_delay=0.0)
@@ -132,6 +134,7 @@ class SandShear(Case):
         return problem(domain, (end, 1), "velocity stress initial_position", [body("sand", material, shape, **start)])
 
     def measure(self, n: int, scene: Scene, frames: Frames) -> dict[str, float]:
+        """Return errors of strength and pressure in the middle at the end, and the friction angle found, degrees."""
         *_, (last, _) = frames
         stress = field(last, "stress")[in_middle(last, scene, 0, MIDDLE * SIZE)].mean(axis=0).reshape(3, 3)
         ratio = (stress[0, 0] - stress[1, 1]) / (stress[0, 0] + stress[1, 1])

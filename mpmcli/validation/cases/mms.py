@@ -144,6 +144,7 @@ class ManufacturedWave(Case):
         )
 
     def tables(self, n: int) -> Tables:
+        """Return a solid that fills n cells per axis, and the force that causes the chosen motion, for one period."""
         wave = self.wave
         d = len(wave.signs)
         size, cells, velocity, force = [1.0] * d, [n] * d, wave.velocity(), wave.force()
@@ -159,6 +160,7 @@ class ManufacturedWave(Case):
         )
 
     def measure(self, n: int, scene: Scene, frames: Frames) -> dict[str, float]:
+        """Return errors of displacement over its amplitude, and of stress over that of the wave, of all frames."""
         wave = self.wave
         squares, largest, stress = [], 0.0, []
         for frame, _ in frames:
@@ -270,6 +272,7 @@ class Vortex(Case):
         )
 
     def measure(self, n: int, scene: Scene, frames: Frames) -> dict[str, float]:
+        """Return errors of position at the end and over all frames, over the arc in the middle of the ring."""
         squares = []
         for frame, _ in frames:
             X = field(frame, "initial_position")

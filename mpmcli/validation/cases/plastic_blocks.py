@@ -21,8 +21,8 @@ SIZE = 0.5
 # Width of the evaluated middle, relative to the size, and empty cells around a block.
 MIDDLE, GAP = 0.15, 4
 # Distance that a wave travels until the end, relative to the size.
-REACH = 0.2
-END = REACH * SIZE / math.sqrt((LAMBDA + 2 * MU) / DENSITY)
+WAVE_PATH = 0.2
+END = WAVE_PATH * SIZE / math.sqrt((LAMBDA + 2 * MU) / DENSITY)
 # Smallest bound of an error: effect of numerical precursors of the waves on the middle.
 LEAST = 1e-6
 
@@ -182,6 +182,7 @@ class PlasticBlocks(Case):
         self.measures = tuple(self.text.measure(block.name, block.bound, rounding=2e-4) for block in self.blocks)
 
     def tables(self, n: int) -> Tables:
+        """Return free blocks, n cells per edge, each with a material and a homogeneous motion of its own."""
         d = self.dimension
         domain, shapes = free_blocks(n, SIZE, len(self.blocks), [GAP] * d)
         bodies, forces = [], []
@@ -196,6 +197,7 @@ class PlasticBlocks(Case):
         return problem(domain, (END, 1), "stress initial_position", bodies, forces=forces)
 
     def measure(self, n: int, scene: Scene, frames: Frames) -> dict[str, float]:
+        """Return the error of J times the stress in the middle of each block at the end, over its scale."""
         *_, (last, _) = frames
         d = self.dimension
         start = field(last, "initial_position")

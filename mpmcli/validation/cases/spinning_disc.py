@@ -33,6 +33,7 @@ class SpinningDisc(Case):
     )
 
     def tables(self, n: int) -> Tables:
+        """Return a disc of n cells of radius that begins with the deformation of steady rotation."""
         k, R = STRETCH, RADIUS
         radial = f"1 + {k!r} * ({(3 - 2 * POISSON) * R**2!r} - X**2 - Y**2"
         cross = f"{-2 * k!r} * X * Y"
@@ -47,6 +48,7 @@ class SpinningDisc(Case):
         return problem(domain, (TURNS * 2 * math.pi / SPIN, TURNS * FRAMES_PER_TURN), "initial_position", [disc])
 
     def measure(self, n: int, scene: Scene, frames: Frames) -> dict[str, float]:
+        """Return the energy lost, the error of the angle turned, and the change of angular momentum."""
         kinetic, momentum, turned, last = [], [], 0.0, 0.0
         for frame, row in frames:
             X = field(frame, "initial_position")

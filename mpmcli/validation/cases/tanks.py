@@ -100,6 +100,7 @@ class Hydrostatic(Case):
         return column(n, 100 * 2 * WEIGHT, (2.0, 40), initial_pressure="hydrostatic")
 
     def measure(self, n: int, scene: Scene, frames: Frames) -> dict[str, float]:
+        """Return the largest error and spread of the pressure, and the largest speed over that of waves."""
         errors, speeds, spreads = [], [], []
         for frame, row in frames:
             Y = field(frame, "initial_position")[:, 1]
@@ -139,6 +140,7 @@ class HydrostaticDrop(Case):
         return column(n, self.modulus, (self.periods * self.period, 40 * self.periods))
 
     def measure(self, n: int, scene: Scene, frames: Frames) -> dict[str, float]:
+        """Return errors of the pressure, of the period of its first harmonic, and of its peak at the base."""
         times, base, exact_base, errors = [], [], [], []
         odd = 2 * np.arange(TERMS) + 1
         share = None
@@ -195,6 +197,7 @@ class FloatingBox(Case):
         return problem(domain, (END, FRAMES), "velocity", [water], colliders=[raft])
 
     def measure(self, n: int, scene: Scene, frames: Frames) -> dict[str, float]:
+        """Return errors of draught, in edges of the box, and force, and the tilt, degrees, of means of the rest."""
         rows = [row for _, row in frames][STILL:]
         pose = np.array([row.rigid_pose[0] for row in rows]).mean(axis=0)
         mass = scene.colliders[0].moments.mass

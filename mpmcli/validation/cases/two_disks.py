@@ -48,6 +48,7 @@ class TwoDisks(Case):
         return problem(domain, (END, FRAMES), "velocity mass", disks)
 
     def measure(self, n: int, scene: Scene, frames: Frames) -> dict[str, float]:
+        """Return how early contact begins, changes of momenta, centre and energy, and the rebound of the disks."""
         times, approach, energies = [], [], []
         linear = angular = way = 0.0
         for frame, row in frames:

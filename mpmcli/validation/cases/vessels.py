@@ -50,6 +50,7 @@ class StillWater(Case):
         return tank(n, (3.0, 60), self.water, self.vessel, initial_pressure="hydrostatic")
 
     def measure(self, n: int, scene: Scene, frames: Frames) -> dict[str, float]:
+        """Return kinetic energy and rise of energy over M g H, drift, cells, and error of the force on the vessel."""
         energies, forces, first = [], [], None
         for frame, row in frames:
             first = frame.position.astype(np.float64) if first is None else first
