@@ -1,8 +1,8 @@
 """The lock of a directory: one writer at a time, named in a lock file.
 
-The operating system holds the lock (flock) and releases it however the process ends. The content of the file identifies
-the owner uniquely, also after it has ended. The file is removed with the lock, so that a remaining file belongs to a
-process that was killed.
+The operating system holds the lock (filelock) and releases it however the process ends. What filelock lacks: the file
+identifies the owner uniquely, also after it has ended; it is removed with the lock, so that a remaining file belongs to
+a process that was killed; and a lock is inspected without being taken.
 """
 
 import errno
@@ -11,12 +11,15 @@ import json
 import os
 import socket
 import time
-from contextlib import ExitStack, suppress
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal
+
+from filelock import FileLock, Timeout
 
 from mpmcli.errors import InputError
 
@@ -138,50 +141,42 @@ def _space() -> str:
 def take_lock(directory: Path) -> ExitStack:
     """Take the lock of a directory, also from a process that has ended; InputError: another process may hold it.
 
-    The first close of the returned stack releases the lock and removes the file.
+    The first close of the returned stack removes the file and releases the lock.
 
-    Inspection and acquisition are atomic: only the holder of the system's lock reads, writes and removes the file. On a
-    file system without locks, two processes may take over the lock at the same moment.
+    Only the holder of the system's lock writes and removes the file. On a file system without locks, two processes may
+    take over the lock at the same moment.
     """
     path = Path(directory) / LOCK
-    until = time.monotonic() + PATIENCE
-    flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_NOFOLLOW", 0)
-    while True:
+    if path.is_symlink():
+        raise InputError(f"{path} is a symbolic link, and mpmcli writes a file there: remove it.")
+    with ExitStack() as held:
         try:
-            descriptor = os.open(path, flags, 0o644)
+            locked = held.enter_context(_system_lock(path))
+            _refuse_foreign(directory, _content(path), locks_work=locked)
+            held.callback(_remove, path)
+            facts = {"machine": socket.gethostname(), "since": time_now(), **asdict(Owner.here())}
+            path.write_text(json.dumps(facts) + "\n", encoding="utf-8")
+        except Timeout:
+            raise InputError(_held(directory, _content(path))) from None
         except OSError as error:
-            if path.is_symlink():
-                raise InputError(f"{path} is a symbolic link, and mpmcli writes a file there: remove it.") from error
             raise refused(directory, "locked", error) from error
-        try:
-            got = _lock(descriptor, exclusive=True)
-            content = _content(path)
-            if got is False and time.monotonic() >= until:
-                raise InputError(_held(directory, content))
-            if got is not False and _is_at(descriptor, path):
-                _refuse_foreign(directory, content, locks_work=got is True)
-                try:
-                    facts = {"machine": socket.gethostname(), "since": time_now(), **asdict(Owner.here())}
-                    os.ftruncate(descriptor, 0)
-                    os.lseek(descriptor, 0, os.SEEK_SET)
-                    os.write(descriptor, (json.dumps(facts) + "\n").encode())
-                except OSError:
-                    # The disk is full.
-                    path.unlink(missing_ok=True)
-                    raise
-                held = ExitStack()
-                held.callback(os.close, descriptor)
-                held.callback(_remove, path)
-                return held
-        except BaseException as error:
-            os.close(descriptor)
-            if isinstance(error, OSError):
-                raise refused(directory, "locked", error) from error
+        return held.pop_all()
+
+
+@contextmanager
+def _system_lock(path: Path) -> Iterator[bool]:
+    """Hold the system's lock of a file; yield False if the file system has none. Timeout: another process holds it."""
+    # The file is removed while it is locked, see `_remove`: waiting processes then try the next one of this name.
+    lock = FileLock(path, timeout=PATIENCE, poll_interval=PAUSE, preserve_lock_file=True, fallback_to_soft=False)
+    try:
+        lock.acquire()
+    except OSError as error:
+        if error.errno not in NO_LOCKS:
             raise
-        # Another process holds it, or the holder has removed the file between the two calls.
-        os.close(descriptor)
-        if got is False:
-            time.sleep(PAUSE)
+    try:
+        yield lock.is_locked
+    finally:
+        lock.release()
 
 
 def _remove(path: Path) -> None:
@@ -202,37 +197,22 @@ def refuse_locked(directory: Path) -> None:
 
 
 def lock_is_held(directory: Path) -> bool:
-    """Return whether a process holds the lock of a directory; False also if the system cannot tell."""
+    """Return whether a process holds the lock of a directory; False also if the system cannot tell.
+
+    A shared lock of the system tells without a file being made or written, which a FileLock cannot.
+    """
     try:
         descriptor = os.open(Path(directory) / LOCK, os.O_RDONLY)
     except OSError:
         return False
     try:
-        return _lock(descriptor, exclusive=False) is False
+        if fcntl is not None:
+            fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        return False
+    except OSError as error:
+        return error.errno in (errno.EWOULDBLOCK, errno.EACCES)
     finally:
         os.close(descriptor)
-
-
-def _lock(descriptor: int, *, exclusive: bool) -> bool | None:
-    """Return whether the system granted the lock; None if it has no locks."""
-    if fcntl is None:
-        return None
-    try:
-        fcntl.flock(descriptor, (fcntl.LOCK_EX if exclusive else fcntl.LOCK_SH) | fcntl.LOCK_NB)
-    except OSError as error:
-        if error.errno in (errno.EWOULDBLOCK, errno.EACCES):
-            return False
-        if error.errno in NO_LOCKS:
-            return None
-        raise
-    return True
-
-
-def _is_at(descriptor: int, path: Path) -> bool:
-    try:
-        return os.path.samestat(os.fstat(descriptor), os.stat(path))
-    except FileNotFoundError:
-        return False
 
 
 def _content(path: Path) -> dict[str, Any]:
