@@ -4,7 +4,6 @@ import hashlib
 import json
 import logging
 import queue
-import signal
 import socket
 import threading
 import time
@@ -14,7 +13,6 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from multiprocessing import connection
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +28,7 @@ from mpmcli.extras import imported
 from mpmcli.materials.registry import load_plugins
 from mpmcli.output.checksums import path_digest
 from mpmcli.output.durable import writing
-from mpmcli.processes.pool import SPAWN, follow_parent, interrupts_blocked, sharing_cores, silence
+from mpmcli.processes.pool import Fault, Workers
 from mpmcli.scene import LoadedScene, Scene, scene_to_toml
 from mpmcli.simulation.engine import Arch
 from mpmcli.simulation.runner import Recording, Runner
@@ -43,8 +41,6 @@ LOOK_AHEAD = 32
 AHEAD = 2
 # Workers that a trajectory may lose before it counts as failed.
 ATTEMPTS = 3
-# Time in which a worker may end and store its kernels, s.
-GRACE = 10.0
 # Seconds between calls of `stop`.
 PATIENCE = 0.2
 _SETTINGS = {
@@ -234,23 +230,8 @@ def trajectory_data(drawn: Draw, run: Recording) -> TrajectoryData:
 class LocalWorkers:
     """Processes of this machine, `count`, that compute tasks in turn, over pipes that no other process can open."""
 
-    def __init__(self, count: int) -> None:
-        self.count = count
-        self._processes: dict[connection.Connection, SPAWN.Process] = {}
-        for _ in range(count):
-            self._start()
-
-    def _start(self) -> connection.Connection:
-        ours, theirs = SPAWN.Pipe()
-        process = SPAWN.Process(target=_serve, args=(theirs,), daemon=True)
-        try:
-            with interrupts_blocked(), sharing_cores(self.count):
-                process.start()
-        except OSError as error:
-            raise RunError(f"the workers do not start ({error}); --resume goes on with what is done.") from error
-        theirs.close()
-        self._processes[ours] = process
-        return ours
+    def __init__(self, workers: Workers[Task]) -> None:
+        self._workers, self.count = workers, workers.count
 
     def outcomes(self, tasks: Iterable[Task], stop: Callable[[], bool]) -> Iterator[tuple[Task, list[Row] | None]]:
         """Yield each task with its rows as it ends, None if no worker survived; RunError: a write failed.
@@ -258,83 +239,30 @@ class LocalWorkers:
         A task whose worker is killed is tried again, its trajectories one by one.
         """
         waiting, lost = deque(tasks), Counter[tuple[int, ...]]()
-        idle, under_way = list(self._processes), {}
-
-        def hand_out() -> None:
-            while waiting and idle:
-                pipe, task = idle.pop(), waiting.popleft()
-                under_way[pipe] = task
-                # A worker that was killed is found when it is read from.
-                with suppress(OSError):
-                    pipe.send(task)
-
-        hand_out()
-        while under_way:
-            ready = connection.wait(under_way, PATIENCE)
-            if stop():
-                raise KeyboardInterrupt
-            found = []
-            for pipe in ready:
-                task = under_way.pop(pipe)
-                try:
-                    answer = pipe.recv()
-                except (EOFError, OSError):
-                    self._processes.pop(pipe).join()
-                    pipe.close()
-                    pipe = self._start()
-                    lost[task.numbers] += 1
-                    answer = None
-                    if len(task.numbers) > 1:
-                        waiting.extendleft(replace(task, numbers=(number,)) for number in reversed(task.numbers))
-                    elif lost[task.numbers] < ATTEMPTS:
-                        waiting.appendleft(task)
-                    else:
-                        found.append((task, None))
-                idle.append(pipe)
-                if isinstance(answer, Exception):
-                    raise answer
-                if answer is not None:
-                    found.append((task, answer))
-            # The workers go on while the caller stores what was found.
-            hand_out()
-            yield from found
-
-    def end(self, wait: float) -> None:
-        """End the workers: each may end its task and store its kernels for `wait` s. Files are whole or absent."""
-        for pipe in self._processes:
-            pipe.close()
-        for process in self._processes.values():
-            process.join(wait)
-            process.kill()
+        for task, answer in self._workers.outcomes(waiting, stop):
+            if isinstance(answer, Exception):
+                raise answer
+            if not isinstance(answer, Fault):
+                yield task, answer
+                continue
+            lost[task.numbers] += 1
+            if len(task.numbers) > 1:
+                waiting.extendleft(replace(task, numbers=(number,)) for number in reversed(task.numbers))
+            elif lost[task.numbers] < ATTEMPTS:
+                waiting.appendleft(task)
+            else:
+                yield task, None
 
 
-def _serve(pipe: connection.Connection) -> None:
-    """Compute the tasks of a pipe until its other end is closed."""
-    silence()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=follow_parent, daemon=True).start()
-    while True:
-        try:
-            task = pipe.recv()
-        except EOFError:
-            break
-        try:
-            answer: object = _compute(task)
-        except Exception as error:
-            answer = error
-        pipe.send(answer)
+def _begin() -> Callable[[Task], list[Row]]:
+    return _compute
 
 
 @contextmanager
 def local_workers(count: int) -> Iterator[LocalWorkers]:
-    """Start workers on this machine, one process each; they end with the block."""
-    workers = LocalWorkers(count)
-    left = 0.0
-    try:
-        yield workers
-        left = GRACE
-    finally:
-        workers.end(left)
+    """Use workers on this machine, one process each; they end with the block."""
+    with Workers(count, _begin) as workers:
+        yield LocalWorkers(workers)
 
 
 class ClusterWorkers:
@@ -386,7 +314,7 @@ class ClusterWorkers:
                 yield task, None
 
 
-Workers = LocalWorkers | ClusterWorkers
+SweepWorkers = LocalWorkers | ClusterWorkers
 
 
 @contextmanager

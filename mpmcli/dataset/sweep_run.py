@@ -16,7 +16,7 @@ from mpmcli.check.facts import SceneFacts
 from mpmcli.check.forecast import expected_steps, layout_of, seconds_of_one
 from mpmcli.cores import available_cores
 from mpmcli.dataset.certify import NAMES, certificates, certify_plan, cost_of_one, plan_text
-from mpmcli.dataset.compute import Task, Workers, joined_workers, local_workers, scene_fault
+from mpmcli.dataset.compute import SweepWorkers, Task, joined_workers, local_workers, scene_fault
 from mpmcli.dataset.draw import draw
 from mpmcli.dataset.folder import (
     MANIFEST,
@@ -351,7 +351,11 @@ class _Run:
             self.state.count(row)
 
     def compute_missing(
-        self, joined: Workers | None, began: float, on_progress: Callable[[SweepState], None], stop: Callable[[], bool]
+        self,
+        joined: SweepWorkers | None,
+        began: float,
+        on_progress: Callable[[SweepState], None],
+        stop: Callable[[], bool],
     ) -> None:
         """Compute trajectories without a row, then certificates; `began` is when the sweep began, s."""
         state, missing = self.state, [n for n in self.folder.all_numbers() if n not in self.rows]
