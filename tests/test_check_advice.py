@@ -36,7 +36,7 @@ DOMINOES = "".join(collider(f"tile{i}", (x, 0.0), (x + 0.04, 0.3), "density = 80
 DRUM = 'shape = { ball = { center = [0.5, 0.5], radius = 0.4 } }\nside = "inside"\n'
 FUNNEL = collider("left", (0.0, 0.5), (0.42, 0.56)) + collider("right", (0.58, 0.5), (1.0, 0.56))
 # Advice that concerns what most scenes below do not have.
-FALSE = {"units", "gravity-up", "friction-coefficient", "friction-angle", "opening", "welds", "restitution", "thin"}
+FALSE = {"units", "gravity-up", "friction-coefficient", "friction-angle", "opening", "weld", "restitution", "thin-body"}
 SCENES = {
     "a dam that breaks": (DAM, set(), {"no-pressure", "stand-off", "slippery"}),
     "a still pool": (body("water", (0.0, 0.0), (1.0, 0.3)), {"no-pressure"}, {"stand-off"}),
@@ -59,7 +59,7 @@ SCENES = {
         {"dissipation", "impact-loss", "stand-off"},
     ),
     "dominoes and a jelly": (DROP + DOMINOES, set(), {"stand-off"}),
-    "dominoes in water": (body("water", (0.0, 0.0), (0.15, 0.6)) + DOMINOES, {"thin", "stand-off"}, set()),
+    "dominoes in water": (body("water", (0.0, 0.0), (0.15, 0.6)) + DOMINOES, {"thin-body", "stand-off"}, set()),
     "a heap of sand": (HEAP, {"slippery"}, {"low-heap"}),
     "a low heap of sand": (body("sand", (0.3, 0.0), (0.7, 0.1)), {"low-heap"}, set()),
     "sand in a drum": (
@@ -90,7 +90,7 @@ SCENES = {
     "up is down": (DOMAIN.replace("-9.81", "9.81") + DAM, {"gravity-up"}, {"units"}),
     "two balls of snow": (
         body("snow", (0.2, 0.3), (0.4, 0.5)) + body("clay", (0.6, 0.3), (0.8, 0.5)),
-        {"welds"},
+        {"weld"},
         set(),
     ),
     "angles for coefficients": (

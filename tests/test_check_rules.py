@@ -587,11 +587,6 @@ def stacked(upper: float, lower: float, **more: object) -> dict:
         ("low-heap", {"material": GRAINS, "shape": box([0.2, 0.0], [0.8, 0.1])}, {"material": GRAINS, "shape": HEAP}),
         ("large-domain", {"domain": {"size": [10.0, 10.0], "cells": [640, 640]}}, {"domain": {"size": [2.0, 2.0]}}),
         (
-            "welds",
-            {"bodies": [{"name": n, "material": METAL, "shape": s} for n, s in (("a", LEFT), ("b", RIGHT))]},
-            {"bodies": [{"name": n, "material": SOLID, "shape": s} for n, s in (("a", LEFT), ("b", RIGHT))]},
-        ),
-        (
             "submerged",
             {
                 "bodies": [
@@ -613,7 +608,7 @@ def stacked(upper: float, lower: float, **more: object) -> dict:
 def test_numbers_in_other_units_or_of_another_kind(rule: str, said: dict, other: dict) -> None:
     """What newcomers write in cm, in degrees for a coefficient, in radians for degrees; the rest is left alone."""
     (finding,) = found(rule, **said)
-    notes = ("low-heap", "large-domain", "welds", "submerged", "overturning")
+    notes = ("low-heap", "large-domain", "submerged", "overturning")
     assert finding.severity == ("note" if rule in notes else "warning")
     assert found(rule, **other) == []
 

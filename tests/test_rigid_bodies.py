@@ -152,7 +152,7 @@ def test_check_sees_what_is_thin_or_begins_inside() -> None:
     on_it = {"shape": box([0.9, 0.2], [1.1, 0.4])}
     crossed = {"shape": box([0.75, 0.35], [0.95, 0.55])}
     expected = [("overlap", "bar 1", 0.4), ("overlap", "bar 2", 1.0), ("overlap", "bar 3", 1.0)]
-    for jelly, thinness in (({}, []), (water, [("thin", "bar 0", 2.0)])):
+    for jelly, thinness in (({}, []), (water, [("thin-body", "bar 0", 2.0)])):
         asked = scene(2, -G, thin, sunk, on_it, crossed, jelly=jelly)
         found = check_scene(LoadedScene(asked, (), "scene.toml")).findings
         found = [one for one in found if one.severity == "warning" and '"bar' in one.what]

@@ -84,6 +84,8 @@ STRESSED = 'The bodies that start with a "deformation" release their stress at o
 RELEASED = ("energy", "momentum", "volume-error")
 STIFFER = "Make the material stiffer, the domain finer, or time.safety lower."
 
+Columns = dict[str, np.ndarray]
+
 
 @dataclass(frozen=True)
 class ResultCheck:
@@ -233,6 +235,102 @@ def _limit_at(opened: OpenedResult, number: int) -> str:
     return next((row.limit for row in reversed(rows) if row.limit), "")
 
 
+@dataclass(frozen=True)
+class LedgerRule:
+    """A rule on each row of a ledger; `bad` and `wrong` take the columns by name, see `_columns`, and return (T,) bool.
+
+    `what` and `fix` are filled in with `number` and the columns of the row; `kind` separates findings of one rule.
+    """
+
+    name: str
+    column: str  # of the value that is reported
+    bad: Callable[[Columns], np.ndarray]
+    what: str
+    fix: str
+    wrong: Callable[[Columns], np.ndarray | bool] = lambda of: False  # a bad row that is an error
+    needs: str = ""  # column without which the rule is skipped
+    kind: str = ""
+
+
+RULES = (
+    LedgerRule(
+        "mass",
+        "mass_change",
+        lambda of: of["mass_change"] > MASS_ERROR,
+        "In frame {number} the mass is {mass:.8g} kg, where the run has {usual_mass:.8g} kg",
+        "The file was changed after the run; copy it again or run the scene again.",
+        wrong=lambda of: True,
+    ),
+    LedgerRule(
+        "energy",
+        "energy_growth",
+        lambda of: of["energy_growth"] > ENERGY_SUSPECT + PASSING * (of["energy_lasting"] < of["energy_growth"] / 2),
+        "By frame {number} the energy has grown by {energy_growth:.3g} of the energy turned over{without}",
+        HALVE_STEP,
+        wrong=lambda of: of["energy_growth"] > ENERGY_WRONG,
+        needs="energy_growth",
+    ),
+    LedgerRule(
+        "courant",
+        "courant_max",
+        lambda of: of["courant_max"] > NODE_COURANT * MARGIN,
+        f"Before frame {{number}} a node moved {{courant_max:.3g}} cells in a step, {NODE_COURANT:g} is safe",
+        "{shorter}",
+        wrong=lambda of: of["courant_max"] > LEFT_BEHIND,
+    ),
+    LedgerRule(
+        "overlap",
+        "contact_overlap",
+        lambda of: of["contact_overlap"] > OVERLAP,
+        "Before frame {number} surfaces that met overlapped by {contact_overlap:.3g} cells",
+        STIFFER,
+        needs="contact_overlap",
+    ),
+    LedgerRule(
+        "volume",
+        "volume_ratio_min",
+        lambda of: of["volume_ratio_min"] <= 0,
+        "In frame {number} a particle has no volume left: the smallest J is {volume_ratio_min:.4g}",
+        STIFFER,
+        wrong=lambda of: True,
+        kind="has no volume left",
+    ),
+    LedgerRule(
+        "volume",
+        "volume_ratio_min",
+        lambda of: (of["volume_ratio_min"] > 0) & (of["volume_ratio_min"] < CRUSHED),
+        "In frame {number} a particle is crushed: the smallest J is {volume_ratio_min:.4g}",
+        STIFFER,
+        kind="is crushed",
+    ),
+    LedgerRule(
+        "volume",
+        "volume_ratio_max",
+        lambda of: of["volume_ratio_max"] > BLOWN_UP,
+        "In frame {number} a particle is blown up: the largest J is {volume_ratio_max:.4g}",
+        STIFFER,
+        needs="coherent",
+        kind="is blown up",
+    ),
+    LedgerRule(
+        "step-collapse",
+        "step_ratio",
+        lambda of: of["step_ratio"] < COLLAPSE,
+        "Before frame {number} the step fell to {step_min:.3g} s, where the run began with {first_step:.3g} s, by the "
+        'bound "{limit}"',
+        "Look for a high speed, stiffness or deformation in this frame.",
+        needs="step_ratio",
+    ),
+)
+# Why the energy of a run is not conserved.
+FORCED = (
+    "Forces, walls that move, or a gravity that depends on time or acts along a periodic axis do work, so that energy "
+    "and momentum are not conserved"
+)
+VARIES = "Material comes or goes, so that energy and momentum are not conserved"
+UNKNOWN_WORK = "Colliders that move do work on rigid bodies, too, so that the balance of energy is not known"
+
+
 def check_ledger(entries: Sequence[Entry], header: RunHeader, findings: FrameFindings) -> dict[str, float | None]:
     """Check all rows, and return figures by name, see `ResultCheck`; None if not available."""
     numbers, rows = [], []
@@ -246,33 +344,71 @@ def check_ledger(entries: Sequence[Entry], header: RunHeader, findings: FrameFin
             rows.append(entry.row)
     if not rows:
         return {}
+    of = _columns(rows, header)
+    balanced = "energy_growth" in of
+    if not balanced:
+        what = VARIES if header.particle_count_varies else FORCED if header.driven else UNKNOWN_WORK
+        findings.add("note", "driven", None, what, "Nothing needs to be done.")
+    without = " beyond the work of colliders" if header.moved else ", without a source"
+    forced = any(row.limit == "forced" for row in rows)
+    words = {"without": without, "shorter": 'Set time.step = "auto".' if forced else LOWER_SAFETY}
+    for rule in RULES:
+        if rule.needs and rule.needs not in of:
+            continue
+        bad = rule.bad(of)
+        wrong = bad & rule.wrong(of)
+        for k in np.flatnonzero(bad).tolist():
+            here = words | vars(rows[k]) | {name: float(column[k]) for name, column in of.items()}
+            what, fix = (text.format(number=numbers[k], **here) for text in (rule.what, rule.fix))
+            severity = "error" if wrong[k] else "warning"
+            findings.add(severity, rule.name, numbers[k], what, fix, here[rule.column], kind=rule.kind)
+    stepped = of["steps"] > 0
+    took = [(row.collider_force, row.time - before.time) for before, row in pairwise(rows) if row.collider_force]
+    impulse = sum(np.sum(force, axis=0) * time for force, time in took)
+    figures = {
+        **{name: of[name].max() for name in ("mass_change", "courant_max", "speed_max", "volume_ratio_max")},
+        "energy_growth": of["energy_growth"].max() if balanced else None,
+        "energy_lost": of["energy_lost"][-1] if balanced else None,
+        "collider_work": of["work"][-1] if balanced and header.moved else None,
+        "volume_ratio_min": of["volume_ratio_min"].min(),
+        "volume_error": _volume_error(numbers, of["volume_error"], findings),
+        "collider_impulse": np.linalg.norm(impulse) if took else None,
+        "contact_overlap": of["contact_overlap"].max() if "contact_overlap" in of else None,
+        "step_min": of["step_min"][stepped].min() if stepped.any() else None,
+        "step_max": of["step_max"].max() if stepped.any() else None,
+        "step_ratio": np.nanmin(of["step_ratio"]) if stepped.any() else None,
+    }
+    return {name: None if value is None else float(value) for name, value in figures.items()}
+
+
+def _columns(rows: Sequence[LedgerRow], header: RunHeader) -> Columns:
+    """Return the numbers of a ledger, (T,) by name, and what follows from them.
+
+    Those that are not known are left out: step_ratio before the first step, energy_growth if something else does work,
+    coherent unless all material is.
+    """
     numeric = [name for name, value in vars(rows[0]).items() if isinstance(value, Real)]
     of = {name: np.array([getattr(row, name) for row in rows]) for name in numeric}
-
-    def tell(
-        rule: str, values: np.ndarray, bad: np.ndarray, wrong: np.ndarray | bool, what: str, fix: str, kind: str = ""
-    ) -> None:
-        """Add a finding for each row that is bad; it is an error if the row is also wrong."""
-        for k in np.flatnonzero(bad).tolist():
-            severity, value = "error" if (bad & wrong)[k] else "warning", float(values[k])
-            said = what.format(number=numbers[k], value=value, row=rows[k])
-            findings.add(severity, rule, numbers[k], said, fix, value, kind=kind or what)
-
+    same = np.ones(len(rows))
     # Mass that has entered or left is not counted. The median identifies a single faulty row, also the first.
-    emitted = of.get("emitted_mass", np.zeros(len(rows)))
+    emitted = of.get("emitted_mass", 0.0 * same)
     mass = of["mass"] - emitted - of.get("nozzle_mass", 0.0) + of.get("retired_mass", 0.0)
-    usual = float(np.median(mass))
-    scale, change = np.maximum(usual, emitted), np.abs(mass - usual)
-    change = np.divide(change, scale, out=(change > 0).astype(float), where=scale > 0)
-    what = f"In frame {{number}} the mass is {{row.mass:.8g}} kg, where the run has {usual:.8g} kg"
-    fix = "The file was changed after the run; copy it again or run the scene again."
-    tell("mass", change, change > MASS_ERROR, True, what, fix)
+    of["usual_mass"] = same * np.median(mass)
+    scale, change = np.maximum(of["usual_mass"], emitted), np.abs(mass - of["usual_mass"])
+    of["mass_change"] = np.divide(change, scale, out=(change > 0).astype(float), where=scale > 0)
+    stepped = of["steps"] > 0
+    if stepped.any():
+        of["first_step"] = same * of["step_max"][stepped][0]
+        of["step_ratio"] = np.where(stepped, of["step_min"] / of["first_step"], np.nan)
+    if header.laws and all(law.coherent for law in header.laws):
+        of["coherent"] = same
     # With rigid bodies that move freely, colliders also do work on these.
-    balanced = not header.driven and (not header.moved or _knows_work(rows, header))
-    work = unsure = np.zeros(len(rows))
-    if balanced and header.moved and "collider_work" in of:
+    if header.driven or (header.moved and not _knows_work(rows, header)):
+        return of
+    work = unsure = 0.0 * same
+    if header.moved and "collider_work" in of:
         work = np.cumsum(of["collider_work"])
-    elif balanced and header.moved:
+    elif header.moved:
         work, unsure = work_of_colliders(rows, header.colliders), unsure_work(rows, header.colliders)
     energies = of["kinetic"], of["potential"] - of["mass"] * lowest_potential(header), of["elastic"]
     lost, (growth, _, lasting) = energy_change(*energies, work)[1], energy_change(*energies, work + unsure)
@@ -280,64 +416,7 @@ def check_ledger(entries: Sequence[Entry], header: RunHeader, findings: FrameFin
         # Contact takes energy up and returns it. All else is known with the work of contact.
         rest, _, stays = energy_change(*energies, work + unsure + np.cumsum(of["contact_work"]))
         growth, lasting = np.maximum(rest, growth - HELD_ENERGY), np.maximum(stays, lasting - HELD_ENERGY)
-    if not balanced:
-        what = (
-            "Forces, walls that move, or a gravity that depends on time or acts along a periodic axis do work, so that "
-        )
-        what += "energy and momentum are not conserved"
-        if header.particle_count_varies:
-            what = "Material comes or goes, so that energy and momentum are not conserved"
-        elif not header.driven:
-            what = "Colliders that move do work on rigid bodies, too, so that the balance of energy is not known"
-        findings.add("note", "driven", None, what, "Nothing needs to be done.")
-    else:
-        what = "By frame {number} the energy has grown by {value:.3g} of the energy turned over, without a source"
-        if header.moved:
-            what = "By frame {number} the energy has grown by {value:.3g} of the energy turned over beyond the work of "
-            what += "colliders"
-        allowed = ENERGY_SUSPECT + PASSING * (lasting < growth / 2)
-        tell("energy", growth, growth > allowed, growth > ENERGY_WRONG, what, HALVE_STEP)
-    courant, forced = of["courant_max"], any(row.limit == "forced" for row in rows)
-    what = f"Before frame {{number}} a node moved {{value:.3g}} cells in a step, {NODE_COURANT:g} is safe"
-    fix = 'Set time.step = "auto".' if forced else LOWER_SAFETY
-    tell("courant", courant, courant > NODE_COURANT * MARGIN, courant > LEFT_BEHIND, what, fix)
-    overlap = of.get("contact_overlap", np.zeros(len(rows)))
-    what = "Before frame {number} surfaces that met overlapped by {value:.3g} cells"
-    tell("overlap", overlap, overlap > OVERLAP, False, what, STIFFER)
-    low, high = of["volume_ratio_min"], of["volume_ratio_max"]
-    what = "In frame {number} a particle has no volume left: the smallest J is {value:.4g}"
-    tell("volume", low, low <= 0, True, what, STIFFER, "has no volume left")
-    what = "In frame {number} a particle is crushed: the smallest J is {value:.4g}"
-    tell("volume", low, (low > 0) & (low < CRUSHED), False, what, STIFFER, "is crushed")
-    coherent = bool(header.laws) and all(law.coherent for law in header.laws)
-    what = "In frame {number} a particle is blown up: the largest J is {value:.4g}"
-    tell("volume", high, (high > BLOWN_UP) & coherent, False, what, STIFFER, "is blown up")
-    stepped = of["steps"] > 0
-    steps: dict[str, float | None] = dict.fromkeys(("step_min", "step_max", "step_ratio"))
-    if stepped.any():
-        first, smallest = float(of["step_max"][stepped][0]), float(of["step_min"][stepped].min())
-        ratio = of["step_min"] / first
-        what = "Before frame {number} the step fell to {row.step_min:.3g} s, where the run began with "
-        what += f'{first:.3g} s, by the bound "{{row.limit}}"'
-        fix = "Look for a high speed, stiffness or deformation in this frame."
-        tell("step-collapse", ratio, stepped & (ratio < COLLAPSE), False, what, fix)
-        steps = {"step_min": smallest, "step_max": float(of["step_max"].max()), "step_ratio": smallest / first}
-    took = [(row.collider_force, row.time - before.time) for before, row in pairwise(rows) if row.collider_force]
-    impulse = sum(np.sum(force, axis=0) * time for force, time in took)
-    return {
-        "mass_change": float(change.max()),
-        "energy_growth": float(growth.max()) if balanced else None,
-        "energy_lost": lost if balanced else None,
-        "collider_work": float(work[-1]) if balanced and header.moved else None,
-        "courant_max": float(courant.max()),
-        "speed_max": float(of["speed_max"].max()),
-        "volume_ratio_min": float(low.min()),
-        "volume_ratio_max": float(high.max()),
-        "volume_error": _volume_error(numbers, of["volume_error"], findings),
-        "collider_impulse": float(np.linalg.norm(impulse)) if took else None,
-        "contact_overlap": float(of["contact_overlap"].max()) if "contact_overlap" in of else None,
-        **steps,
-    }
+    return of | {"work": work, "energy_growth": growth, "energy_lasting": lasting, "energy_lost": same * lost}
 
 
 def _finite(value: object) -> bool:

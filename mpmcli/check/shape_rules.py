@@ -127,7 +127,7 @@ def _welding(facts: SceneFacts) -> Iterator[Finding]:
     yielding = [one.name for one in scene.sources if one.material.law in WELDING and not facts.contacts.separates(one)]
     if yielding and len(yielding) + sum(one.has_surface and not facts.contacts.parts for one in scene.sources) > 1:
         what = f"The material of {several(quoted(yielding))} yields: solids that it meets weld to it, and do not slide."
-        fix = "Nothing needs to be done; with a surface_friction, metal and clay separate."
+        fix = "Make those elastic, or rigid, that need not yield; with a surface_friction, metal and clay separate."
         yield Finding("note", "weld", what, fix, len(yielding), yielding[0])
 
 
@@ -318,7 +318,7 @@ def _rigid(facts: SceneFacts) -> Iterator[Finding]:
         if cells < FEWEST_CELLS and between:
             what = f'Rigid body "{body.name}" is {cells:.2g} cells thick: material on both sides interacts through it.'
             fix = f"Make it {FEWEST_CELLS:g} cells thick, or the spacing {h * cells / FEWEST_CELLS:.2g} m."
-            yield Finding("warning", "thin", what, fix, cells, body.name)
+            yield Finding("warning", "thin-body", what, fix, cells, body.name)
         long = np.where(shut.all(axis=1), (upper - lower) / scene.domain.size, 0.0)
         if long.max() > 1:
             what = f'Rigid body "{body.name}" is {long.max():.3g} times as long as the domain between its walls.'

@@ -12,7 +12,7 @@ from mpmcli.check.shape_rules import INSTANTS
 from mpmcli.scene.colliders import Collider
 from mpmcli.scene.entry import tree_of
 from mpmcli.scene.mesh import Rotation
-from mpmcli.scene.problem import quoted, several
+from mpmcli.scene.problem import several
 from mpmcli.scene.quadrature import largest_of
 from mpmcli.scene.quantity import AXES
 from mpmcli.scene.rigid import Hinge
@@ -37,7 +37,7 @@ HEAP = 8.0
 def unit_findings(facts: SceneFacts) -> Iterator[Finding]:
     """Yield the findings on numbers that look wrong."""
     units = (_gravity, _density, _modulus, _turns, _rotations)
-    for rule in (*units, _friction, _angle, _room, _heap, _welds, _restitution):
+    for rule in (*units, _friction, _angle, _room, _heap, _restitution):
         yield from rule(facts)
 
 
@@ -186,17 +186,6 @@ def _heap(facts: SceneFacts) -> Iterator[Finding]:
             what = f'Body "{body.name}" of sand is {cells:.3g} cells high: the slope of a lower heap is not resolved.'
             fix = f"Make domain.spacing {body.height / HEAP:.3g} m for {HEAP:g} cells."
             yield Finding("note", "low-heap", what, fix, cells, body.name)
-
-
-def _welds(facts: SceneFacts) -> Iterator[Finding]:
-    """Yield plastic solids, which share a velocity field and join where they meet."""
-    shared = (one for one in facts.bodies if not facts.contacts.separates(one.body))
-    plastic = (one for one in shared if one.law.deformation == "F" and one.law.projects)
-    solid = [one.name for one in plastic if one.body.material.law != "sand"]
-    if len(solid) > 1:
-        what = f"The bodies {several(quoted(solid))} can flow: where they meet they stick, and become one."
-        fix = "Make those that need not deform elastic, or colliders with a density."
-        yield Finding("note", "welds", what, fix, len(solid), solid[0])
 
 
 def _restitution(facts: SceneFacts) -> Iterator[Finding]:
