@@ -110,6 +110,7 @@ class Workers(Generic[T]):
         return self
 
     def __exit__(self, *_: object) -> None:
+        """End idle processes, which may store what they keep, and terminate those at work."""
         busy = [child for _, child, _ in self._going.values()]
         try:
             for child in busy:
@@ -143,6 +144,7 @@ class Workers(Generic[T]):
             yield from answers
 
     def _hand_out(self, tasks: deque[T]) -> None:
+        """Give each idle process a task, and start others up to the largest number."""
         while tasks and len(self._going) < self.count:
             child = self._idle.pop() if self._idle else _Child.start(self._begin, self.count)
             task = tasks.popleft()
