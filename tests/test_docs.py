@@ -319,6 +319,26 @@ def test_the_gallery_is_what_the_script_writes(scripts):
         assert f"(pictures/{path.stem}.png)" in gallery and (ROOT / "docs" / "pictures" / f"{path.stem}.png").exists()
 
 
+def test_the_report_of_a_gpu_has_the_form_that_the_script_writes(scripts):
+    """The page lists its parts; the section has their headings and the heads of their tables."""
+    gpu = scripts("gpu_report.py")
+    step = {"particles": 1, "runs": 1, "step_ms": 1.0, "host_ms": 0.1, "compile_s": 1.0, "kernels": {}}
+    side = {"ns_per_particle_step": 1.0}
+    case = {"case": "a", "particles": 1, "peer": "mpm88", "sides": {"mpmcli": side, "mpm88": side}}
+    times = dict.fromkeys(("compile_s", "solve_s", "wall_s"), 1.0)
+    run = {"particles": 1, "steps": 1, "timings": times, "particle_steps_per_s": 1.0, "status": "finished"}
+    others = {"tests": {"passed": 1}, "speed": {"cases": [case]}, "runs": {"rows": {"a": run}}}
+    parts = {name: others.get(name, {"rows": {"a": step}}) for name in gpu.PARTS}
+    written = gpu.report({"machine": "a", "parts": parts})
+
+    def outline(text: str) -> list[str]:
+        return re.findall(r"^(?:### .*|\|.*\|(?=\n\| ---))", text, re.MULTILINE)
+
+    page, _, rest = PAGES["docs/gpu.md"].partition("<!-- gpu:")
+    assert re.findall(r"^\| (\w+) \|", page, re.MULTILINE)[1:] == [*gpu.PARTS]
+    assert outline(rest.partition("<!-- end of gpu -->")[0]) == outline(written)
+
+
 def test_records_of_the_bench_are_told_as_ratios(scripts):
     """Of the first record of the same machine, case and threads."""
 
