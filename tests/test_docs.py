@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command import ROOT
+from small_plants import SMALL_PLANTS
 
 from mpmcli.dataset.formats import FORMATS
 from mpmcli.materials.registry import parameter_models
@@ -20,6 +21,7 @@ from mpmcli.output import open_result
 from mpmcli.output.layout import COLUMNS
 from mpmcli.scene import load_scene, parse_scene, scene_to_toml
 from mpmcli.scene.expression import FUNCTIONS
+from mpmcli.validation.cases import all_cases
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 # The README's commands come first: the others read the result that it makes.
@@ -382,6 +384,15 @@ def test_the_table_of_error_against_seconds_has_every_program(scripts):
     rows = [{"program": p, "n": n, "particles": 1, "steps": 1, "error": e, "seconds": s} for p, n, e, s in runs]
     ratios = [line.split("|")[-2].strip() for line in peers.table(rows).splitlines()[2:]]
     assert ratios == ["1.00", "1.00", "0.50", ""]
+
+
+def test_the_page_on_validation_has_every_case_and_the_number_of_plants_found():
+    page = PAGES["docs/validation.md"]
+    verdicts = dict(re.findall(r"^\| (\w+) \| [^|]+ \| (pass|fail) \|", page, re.MULTILINE))
+    assert verdicts.keys() == all_cases().keys()
+    assert f"{[*verdicts.values()].count('pass')} of {len(verdicts)} pass" in page
+    found = sum(not plant.missed for plant in SMALL_PLANTS)
+    assert f"they detect {found} of {len(SMALL_PLANTS)}." in page
 
 
 def test_a_section_is_replaced_between_its_markers(scripts, tmp_path):
