@@ -10,16 +10,18 @@ import sys
 import tomllib
 from pathlib import Path
 
+import click
 import numpy as np
 import pytest
 from command import ROOT
 from small_plants import SMALL_PLANTS
 
+from mpmcli.cli.program import program
 from mpmcli.dataset.formats import FORMATS
 from mpmcli.materials.registry import parameter_models
 from mpmcli.output import open_result
 from mpmcli.output.layout import COLUMNS
-from mpmcli.scene import load_scene, parse_scene, scene_to_toml
+from mpmcli.scene import Scene, load_scene, parse_scene, scene_to_toml
 from mpmcli.scene.expression import FUNCTIONS
 from mpmcli.validation.cases import all_cases
 
@@ -106,6 +108,36 @@ def test_links_lead_somewhere(name: str) -> None:
         path = (ROOT / name).parent / place if place else ROOT / name
         assert path.exists(), f"{name}: {target}"
         assert not anchor or anchor in anchors(path), f"{name}: {target}"
+
+
+def test_sections_of_the_theory_that_are_cited_exist():
+    sections = set(re.findall(r"^#{2,3} ([\d.]+) ", PAGES["docs/theory.md"], re.MULTILINE))
+    files = [
+        *PAGES,
+        *(str(p.relative_to(ROOT)) for d in ("mpmcli", "tests", "scripts") for p in (ROOT / d).rglob("*.*")),
+    ]
+    for name in files:
+        if name.endswith((".md", ".py", ".toml")):
+            text = (ROOT / name).read_text(encoding="utf-8")
+            assert set(re.findall(r"theory\.md,(?: section)? (\d+(?:\.\d+)?)", text)) <= sections, name
+    plain = re.sub(r"`.*?`|\|.*\|", "", PAGES["docs/theory.md"])
+    assert set(re.findall(r"\((?:section )?(\d\.\d{1,2})(?:, \d\.\d+)*\)", plain)) <= sections
+
+
+def test_options_and_keys_on_the_pages_exist():
+    """The long options are those of mpmcli or of a script, and words such as `time.end` keys of a scene."""
+
+    def options(command: click.Command) -> set[str]:
+        names = {name for one in command.params for name in one.opts}
+        below = command.list_commands(None) if isinstance(command, click.Group) else []
+        return names.union(*(options(command.get_command(None, name)) for name in below))
+
+    scripts = " ".join(path.read_text(encoding="utf-8") for path in (ROOT / "scripts").iterdir() if path.is_file())
+    known = options(program) | {"--help"} | set(re.findall(r"--[a-z][a-z-]+", scripts))
+    for name, page in PAGES.items():
+        assert set(re.findall(r"(?<![\w-])--[a-z][a-z-]+", page)) <= known, name
+        for table, key in re.findall(r"`(domain|time|solver|contact|output)\.(\w+)\b", page):
+            assert key in Scene.model_fields[table].annotation.model_fields or key == "py", f"{name}: {table}.{key}"
 
 
 def test_the_shorter_demo_is_what_the_readme_says():
