@@ -346,7 +346,7 @@ def test_the_scene_table_covers_every_config(scripts):
 
 
 def test_the_gallery_is_what_the_script_writes(scripts):
-    """Of every scene, from its header and the tables of the page on scenes."""
+    """Of every scene, from its header."""
     gallery = scripts("picture_table").gallery()
     assert gallery in PAGES["docs/gallery.md"]
     for path in (ROOT / "configs").glob("*.toml"):
