@@ -167,6 +167,14 @@ def test_the_page_on_the_code_has_the_order_of_imports() -> None:
     assert f"within a level: {' → '.join(rooms)}." in ARCHITECTURE
 
 
+def test_the_page_on_the_code_names_what_there_is() -> None:
+    """Each `file.py` is in the repository, and defines each name of `file.py: name`."""
+    for place, name in re.findall(r"`([\w/]+\.py)\b(?:: (\w[\w.]*\w))?", ARCHITECTURE):
+        texts = [path.read_text(encoding="utf-8") for path in SOURCES if path.as_posix().endswith(f"/{place}")]
+        parts = [rf"(?m)\b(def|class) {part}\b|^ *{part}\b.*=" for part in name.split(".") if part]
+        assert any(all(re.search(part, text) for part in parts) for text in texts), f"{place}: {name}"
+
+
 def named_between(start: str, end: str) -> set[str]:
     """Return the files that the page on the code names between two words."""
     return set(re.findall(r"`([\w/]+\.py)`", ARCHITECTURE.partition(start)[2].partition(end)[0]))
