@@ -10,16 +10,20 @@ import sys
 import tomllib
 from pathlib import Path
 
+import click
 import numpy as np
 import pytest
 from command import ROOT
+from small_plants import SMALL_PLANTS
 
+from mpmcli.cli.program import program
 from mpmcli.dataset.formats import FORMATS
 from mpmcli.materials.registry import parameter_models
 from mpmcli.output import open_result
 from mpmcli.output.layout import COLUMNS
-from mpmcli.scene import load_scene, parse_scene, scene_to_toml
+from mpmcli.scene import Scene, load_scene, parse_scene, scene_to_toml
 from mpmcli.scene.expression import FUNCTIONS
+from mpmcli.validation.cases import all_cases
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 # The README's commands come first: the others read the result that it makes.
@@ -104,6 +108,36 @@ def test_links_lead_somewhere(name: str) -> None:
         path = (ROOT / name).parent / place if place else ROOT / name
         assert path.exists(), f"{name}: {target}"
         assert not anchor or anchor in anchors(path), f"{name}: {target}"
+
+
+def test_sections_of_the_theory_that_are_cited_exist():
+    sections = set(re.findall(r"^#{2,3} ([\d.]+) ", PAGES["docs/theory.md"], re.MULTILINE))
+    files = [
+        *PAGES,
+        *(str(p.relative_to(ROOT)) for d in ("mpmcli", "tests", "scripts") for p in (ROOT / d).rglob("*.*")),
+    ]
+    for name in files:
+        if name.endswith((".md", ".py", ".toml")):
+            text = (ROOT / name).read_text(encoding="utf-8")
+            assert set(re.findall(r"theory\.md,(?: section)? (\d+(?:\.\d+)?)", text)) <= sections, name
+    plain = re.sub(r"`.*?`|\|.*\|", "", PAGES["docs/theory.md"])
+    assert set(re.findall(r"\((?:section )?([1-9]\.\d{1,2})(?:, \d\.\d+)*\)", plain)) <= sections
+
+
+def test_options_and_keys_on_the_pages_exist():
+    """The long options are those of mpmcli or of a script, and words such as `time.end` keys of a scene."""
+
+    def options(command: click.Command) -> set[str]:
+        names = {name for one in command.params for name in one.opts}
+        below = command.list_commands(None) if isinstance(command, click.Group) else []
+        return names.union(*(options(command.get_command(None, name)) for name in below))
+
+    scripts = " ".join(path.read_text(encoding="utf-8") for path in (ROOT / "scripts").iterdir() if path.is_file())
+    known = options(program) | {"--help"} | set(re.findall(r"--[a-z][a-z-]+", scripts))
+    for name, page in PAGES.items():
+        assert set(re.findall(r"(?<![\w-])--[a-z][a-z-]+", page)) <= known, name
+        for table, key in re.findall(r"`(domain|time|solver|contact|output)\.(\w+)\b", page):
+            assert key in Scene.model_fields[table].annotation.model_fields or key == "py", f"{name}: {table}.{key}"
 
 
 def test_the_shorter_demo_is_what_the_readme_says():
@@ -312,11 +346,31 @@ def test_the_scene_table_covers_every_config(scripts):
 
 
 def test_the_gallery_is_what_the_script_writes(scripts):
-    """Of every scene, from its header and the tables of the page on scenes."""
+    """Of every scene, from its header."""
     gallery = scripts("picture_table").gallery()
     assert gallery in PAGES["docs/gallery.md"]
     for path in (ROOT / "configs").glob("*.toml"):
         assert f"(pictures/{path.stem}.png)" in gallery and (ROOT / "docs" / "pictures" / f"{path.stem}.png").exists()
+
+
+def test_the_report_of_a_gpu_has_the_form_that_the_script_writes(scripts):
+    """The page lists its parts; the section has their headings and the heads of their tables."""
+    gpu = scripts("gpu_report.py")
+    step = {"particles": 1, "runs": 1, "step_ms": 1.0, "host_ms": 0.1, "compile_s": 1.0, "kernels": {}}
+    side = {"ns_per_particle_step": 1.0}
+    case = {"case": "a", "particles": 1, "peer": "mpm88", "sides": {"mpmcli": side, "mpm88": side}}
+    times = dict.fromkeys(("compile_s", "solve_s", "wall_s"), 1.0)
+    run = {"particles": 1, "steps": 1, "timings": times, "particle_steps_per_s": 1.0, "status": "finished"}
+    others = {"tests": {"passed": 1}, "speed": {"cases": [case]}, "runs": {"rows": {"a": run}}}
+    parts = {name: others.get(name, {"rows": {"a": step}}) for name in gpu.PARTS}
+    written = gpu.report({"machine": "a", "parts": parts})
+
+    def outline(text: str) -> list[str]:
+        return re.findall(r"^(?:### .*|\|.*\|(?=\n\| ---))", text, re.MULTILINE)
+
+    page, _, rest = PAGES["docs/gpu.md"].partition("<!-- gpu:")
+    assert re.findall(r"^\| (\w+) \|", page, re.MULTILINE)[1:] == [*gpu.PARTS]
+    assert outline(rest.partition("<!-- end of gpu -->")[0]) == outline(written)
 
 
 def test_records_of_the_bench_are_told_as_ratios(scripts):
@@ -362,6 +416,15 @@ def test_the_table_of_error_against_seconds_has_every_program(scripts):
     rows = [{"program": p, "n": n, "particles": 1, "steps": 1, "error": e, "seconds": s} for p, n, e, s in runs]
     ratios = [line.split("|")[-2].strip() for line in peers.table(rows).splitlines()[2:]]
     assert ratios == ["1.00", "1.00", "0.50", ""]
+
+
+def test_the_page_on_validation_has_every_case_and_the_number_of_plants_found():
+    page = PAGES["docs/validation.md"]
+    verdicts = dict(re.findall(r"^\| (\w+) \| [^|]+ \| (pass|fail) \|", page, re.MULTILINE))
+    assert verdicts.keys() == all_cases().keys()
+    assert f"{[*verdicts.values()].count('pass')} of {len(verdicts)} pass" in page
+    found = sum(not plant.missed for plant in SMALL_PLANTS)
+    assert f"they detect {found} of {len(SMALL_PLANTS)}." in page
 
 
 def test_a_section_is_replaced_between_its_markers(scripts, tmp_path):

@@ -19,6 +19,8 @@ ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "mpmcli"
 MODULES = sorted(PACKAGE.rglob("*.py"))
 SOURCES = sorted([*MODULES, *(ROOT / "tests").rglob("*.py")])
+# The page without its line breaks.
+ARCHITECTURE = " ".join((ROOT / "docs" / "architecture.md").read_text(encoding="utf-8").split())
 
 # Imports run downwards only, or within a level.
 LEVELS = {
@@ -157,6 +159,35 @@ def test_taichi_is_imported_where_kernels_live_and_nowhere_else() -> None:
             yield from (line for name, line in imports(path) if name.split(".")[0] == "taichi")
 
     assert not offenders(taichi)
+
+
+def test_the_page_on_the_code_has_the_order_of_imports() -> None:
+    levels = sorted(set(LEVELS.values()), reverse=True)
+    rooms = (", ".join(f"`{room}`" for room, its in LEVELS.items() if its == level) for level in levels)
+    assert f"within a level: {' → '.join(rooms)}." in ARCHITECTURE
+
+
+def test_the_page_on_the_code_names_what_there_is() -> None:
+    """Each `file.py` is in the repository, and defines each name of `file.py: name`."""
+    for place, name in re.findall(r"`([\w/]+\.py)\b(?:: (\w[\w.]*\w))?", ARCHITECTURE):
+        texts = [path.read_text(encoding="utf-8") for path in SOURCES if path.as_posix().endswith(f"/{place}")]
+        parts = [rf"(?m)\b(def|class) {part}\b|^ *{part}\b.*=" for part in name.split(".") if part]
+        assert any(all(re.search(part, text) for part in parts) for text in texts), f"{place}: {name}"
+
+
+def named_between(start: str, end: str) -> set[str]:
+    """Return the files that the page on the code names between two words."""
+    return set(re.findall(r"`([\w/]+\.py)`", ARCHITECTURE.partition(start)[2].partition(end)[0]))
+
+
+def test_the_page_on_the_code_names_what_imports_taichi_itself() -> None:
+    direct = {str(p.relative_to(PACKAGE)) for p in MODULES if any(n.split(".")[0] == "taichi" for n, _ in imports(p))}
+    assert named_between("use taichi:", "No module below") == direct
+
+
+def test_the_page_on_the_code_names_what_moves_files() -> None:
+    moving = {str(p.relative_to(PACKAGE)) for p in MODULES if {"os.replace", "os.rename"} & {n for n, _ in calls(p)}}
+    assert named_between("A file gets its name", "`output/lock.py`") == moving
 
 
 def test_annotations_are_never_postponed() -> None:

@@ -145,15 +145,15 @@ class Contact(Table):
 
     default: Literal["auto", "stick", "separate"] = Field(
         "auto",
-        description='"separate": each elastic body has a velocity field of its own; they meet each other, all other '
-        "material, and walls and colliders that separate, where their surfaces are, slide with friction, and part. "
-        'Liquids, grains and bodies that yield stick to each other. "stick": bodies share one velocity field, meet up '
-        'to two cells before they touch, and do not slide. "auto": "separate" with an elastic body that can meet '
-        'anything, unless settings of the solver exclude it; otherwise "stick".',
+        description='"separate": each elastic body, and each of von_mises with a surface_friction, has a velocity '
+        "field of its own; they meet each other, all other material, and walls and colliders that separate, where "
+        'their surfaces are, slide with friction, and part. All others stick to each other. "stick": bodies share one '
+        'velocity field, meet up to two cells before they touch, and do not slide. "auto": "separate" with such a body '
+        'that can meet anything, unless settings of the solver exclude it; otherwise "stick".',
     )
     friction: NotNegative | None = Field(
         None,
-        description="Coefficient of Coulomb friction, 0 for liquids. Default: that of the elastic body, the softer of "
-        "two, `surface_friction`.",
+        description="Coefficient of Coulomb friction, 0 for liquids. Default: `surface_friction` of the body that "
+        "separates, of the softer of two.",
     )
     pairs: tuple[ContactPair, ...] = Field((), description="Pairs of bodies with contact of their own.")
