@@ -18,7 +18,7 @@ from mpmcli.output import Result, open_result
 from mpmcli.output.layout import SEGMENTS
 from mpmcli.render.picture_file import settings_digest, write_picture
 from mpmcli.render.render_scene import APPEARANCES, result_of_start
-from mpmcli.render.request import Request, plan_render
+from mpmcli.render.request import Request, plan_render, speed_text
 from mpmcli.render.settings import THEMES
 from mpmcli.scene import load_scene
 
@@ -248,7 +248,8 @@ def test_stdout_gets_the_paths_that_were_asked_for(run: Path, tmp_path: Path) ->
     outcome = run_here("render", run, *words, "--save-surface", meshes, "--workers", 1)
     assert outcome.stdout.splitlines() == [*pictures, str(meshes)]
     outcome = run_here("render", run, *words, "--movie", film, "--fps", 5)
-    assert outcome.stdout == f"{film}\n" and outcome.stderr == "0 pictures made, 2 were there already\n"
+    assert outcome.stdout == f"{film}\n"
+    assert outcome.stderr.startswith("0 pictures made, 2 were there already; film: 5 frames per second, 1/")
 
 
 def test_matplotlib_does_not_talk_in_between(run: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -299,6 +300,26 @@ def test_a_film_has_its_frames_and_its_length(run: Path, tmp_path: Path) -> None
     assert film.stat().st_mtime_ns == before
     assert rendered(run, "--movie", film, "--fps", 24)["made"] == 0
     assert imageio_ffmpeg.count_frames_and_secs(str(film))[1] == pytest.approx(FRAMES / 24, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("pause", "fps", "name", "rate", "speed"),
+    [
+        (0.02, None, "film.mp4", 50, "in real time"),
+        (0.04, None, "film.gif", 25, "in real time"),
+        (0.02, 10, "film.mp4", 10, "1/5 of real time"),
+        (0.0001, None, "film.mp4", 30, "1/333 of real time"),
+        (0.0175, None, "film.gif", 30, "1/1.9 of real time"),
+        (1.0, None, "film.mp4", 30, "30 times real time"),
+        (0.0, None, "film.mp4", 30, "in real time"),
+    ],
+)
+def test_a_film_keeps_the_time_of_its_scene(
+    pause: float, fps: float | None, name: str, rate: float, speed: str
+) -> None:
+    times = pause * np.arange(5)
+    found = Request(movie=Path(name), fps=fps).rate_of(times)
+    assert found == pytest.approx(rate) and speed_text(found, times) == speed
 
 
 def test_an_interrupt_ends_a_film_that_is_put_together(run: Path, tmp_path: Path) -> None:

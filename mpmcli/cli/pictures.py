@@ -49,6 +49,18 @@ WIDEST = 3
     metavar="iso|front|side|top|x,y,z,x,y,z",
     help="Camera of 3D scenes: a name, or its position and target, m.",
 )
+@click.option(
+    "--cameras",
+    is_flag=False,
+    flag_value="",
+    metavar="[FILE]",
+    help="Write images for training of the cameras of the scene, or of a file with [[cameras]].",
+)
+@click.option(
+    "--what",
+    metavar="NAMES",
+    help="With --cameras: some of rgb, depth, mask, flow, normal, with commas; all but normal by default.",
+)
 @choice_option("--theme", list(THEMES), "light", "Colours of background and text.")
 @choice_option(
     "--colliders",
@@ -57,7 +69,7 @@ WIDEST = 3
     "Style of colliders; clear: in 3D only their far sides, which hide nothing; auto: hollow ones are cut open.",
 )
 @click.option("--movie", type=PATH, metavar="FILE", help="Make a film: .mp4 or .gif.")
-@click.option("--fps", type=float, help="Frames of the film per second, 30 by default.")
+@click.option("--fps", type=float, help="Frames of the film per second; by default those of real time, or 30.")
 @click.option("--montage", metavar="CxR", help="One picture of evenly spaced frames, in C columns and R rows.")
 @click.option(
     "--save-surface",
@@ -69,7 +81,15 @@ WIDEST = 3
 @click.option("--overwrite", is_flag=True, help="Render existing pictures again, and replace files of other programs.")
 @quiet_option
 @json_option
-def render_command(result: Path, workers: int | None, quiet: bool, as_json: bool, **asked: Any) -> int:
+def render_command(
+    result: Path,
+    workers: int | None,
+    quiet: bool,
+    as_json: bool,
+    cameras: str | None,
+    what: str | None,
+    **asked: Any,
+) -> int:
     """Draw frames of a RESULT without a screen: pictures, a film (--movie) or a montage.
 
     RESULT may be a scene (.toml): its start is drawn, with velocities, forces on bodies and held parts, into
@@ -77,6 +97,9 @@ def render_command(result: Path, workers: int | None, quiet: bool, as_json: bool
 
     RESULT may be a dataset: its montage shows evenly spaced trajectories at one frame, the middle one or --frame, and
     is written to montage.png in the dataset.
+
+    With --cameras, images for training are written to the directory cameras: for each camera and frame colours, depth,
+    masks and flow, and the matrices of the cameras.
 
     RESULT is a directory, or particles.vtkhdf, of a run that has ended or is running. Existing pictures that are up to
     date are not drawn again. The path of each picture, or that of the film, and the directory of the surfaces are
@@ -95,6 +118,10 @@ def render_command(result: Path, workers: int | None, quiet: bool, as_json: bool
     # Without a home directory it warns about its cache.
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
     request = Request(**asked)
+    if what is not None and cameras is None:
+        raise InputError("--what names the images of --cameras: give that, too.")
+    if cameras is not None:
+        return _images(open_result(result), request, Path(cameras) if cameras else None, what, workers, quiet, as_json)
     with ExitStack() as stack:
         if result.suffix == ".toml":
             of_results = {"--frame": request.frames, "--movie": request.movie, "--montage": request.montage}
@@ -117,8 +144,38 @@ def render_command(result: Path, workers: int | None, quiet: bool, as_json: bool
     elif not quiet:
         kept = len(done.pictures) - done.made
         there = f", {kept} {'was' if kept == 1 else 'were'} there already" if kept else ""
-        print_note(f"{counted(done.made, 'picture')} made{there}")
+        print_note(f"{counted(done.made, 'picture')} made{there}{done.speed and f'; film: {done.speed}'}")
         print_text("\n".join(map(str, done.paths)))
+    return 0
+
+
+def _images(
+    result: Any,
+    request: Any,
+    cameras: Path | None,
+    what: str | None,
+    workers: int | None,
+    quiet: bool,
+    as_json: bool,
+) -> int:
+    """Write the images of cameras."""
+    from mpmcli.cli.progress import ProgressBar
+    from mpmcli.cores import available_cores
+    from mpmcli.plain_text import counted
+    from mpmcli.render.camera_images import image_request
+
+    plan = image_request(result, request, cameras, what)
+    for note in plan.notes:
+        print_note(f"warning: {note}")
+    with ProgressBar(len(plan.due), "frames", quiet=quiet) as bar, interrupts_wait():
+        plan.carry_out(workers or available_cores(), watch=bar.show, stop=interrupt_came)
+    if as_json:
+        print_json(plan.as_dict())
+    elif not quiet:
+        print_note(
+            f"images of {counted(len(plan.due), 'frame')} from {counted(len(plan.asked.cameras), 'camera')} made"
+        )
+        print_text(str(plan.directory))
     return 0
 
 

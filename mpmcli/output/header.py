@@ -72,6 +72,7 @@ class _StoredScene(_Facts):
     bodies: tuple[_Body, ...] = ()
     emitters: tuple[_Body, ...] = ()
     colliders: tuple[dict[str, Any], ...] = ()
+    cameras: tuple[dict[str, Any], ...] = ()
     forces: tuple[Any, ...] = ()
     impulses: tuple[Any, ...] = ()
 

@@ -1,5 +1,6 @@
 """An off-screen window, reused for all frames of a film: one rendering gives colours and depths."""
 
+import weakref
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,11 +15,15 @@ from mpmcli.render.view import View, corners_of
 if TYPE_CHECKING:
     import pyvista as pv
 
+# Position of the light in the axes of a camera: to the right, up, and towards the viewer.
+LAMP = np.array([-0.6, 0.9, 1.6])
+
 
 class OffscreenRenderer:
     """A window of the size of a view; `samples` of its pixels along each axis are averaged to one."""
 
     def __init__(self, view: View, theme: Theme, *, samples: int = 1) -> None:
+        """Open the window, which is closed with this object."""
         import pyvista as pv
 
         self.view, self.samples, self._theme = view, samples, theme
@@ -28,10 +33,14 @@ class OffscreenRenderer:
         self._corners = 0, 0, width * samples - 1, height * samples - 1
         self.plotter.background_color = theme.ground
         self.plotter.disable_anti_aliasing()
+        # PyVista keeps every plotter that is not closed.
+        weakref.finalize(self, self.plotter.close).atexit = False
         view.place(self.plotter)
 
     def add_box(self, scene: RenderScene, width: float = 1.5) -> None:
-        """Draw the edges of the domain except the three in front, which would cross its contents."""
+        """Draw the edges of the domain except the three in front, which would cross its contents; see `View.lit`."""
+        if self.view.lit:
+            return
         import pyvista as pv
 
         corners, color = corners_of(scene), self._theme.wall
@@ -56,12 +65,14 @@ class OffscreenRenderer:
         )
 
     def add_light(self) -> None:
-        """Add a light above and to the left of the camera."""
+        """Add a light above and to the left of the camera; for several cameras one in the scene, and one opposite."""
         import pyvista as pv
 
-        light = pv.Light(light_type="camera light", intensity=1.0)
-        light.position, light.focal_point = (-0.6, 0.9, 1.6), (0.0, 0.0, 0.0)
-        self.plotter.add_light(light)
+        lit = self.view.lit
+        for place, intensity in ((LAMP, 1.0), (LAMP * [-1.0, 1.0, -1.0], 0.6))[: 2 if lit else 1]:
+            light = pv.Light(light_type="scene light" if lit else "camera light", intensity=intensity)
+            light.position, light.focal_point = tuple(place @ lit.axes if lit else place), (0.0, 0.0, 0.0)
+            self.plotter.add_light(light)
 
     def render(self) -> None:
         """Render the window for `picture` and `depth`."""

@@ -18,7 +18,7 @@ from mpmcli.render.dots import DotsPainter
 from mpmcli.render.outline import OutlinePainter
 from mpmcli.render.picture_file import digest_of, settings_digest, write_picture
 from mpmcli.render.picture_layout import PictureLayout, time_text
-from mpmcli.render.render_scene import RenderScene, render_scene_of
+from mpmcli.render.render_scene import RenderScene, SharedGeometry, render_scene_of
 from mpmcli.render.settings import THEMES, Settings, Theme, require_possible
 from mpmcli.render.view import View, aspect_of, slice_of, view_of
 from mpmcli.render.window import choose_window
@@ -55,8 +55,13 @@ class RenderSetup:
     view: View
     captions: tuple[str, ...] = ()  # above the pictures of a montage, by frame; empty for their times
 
-    def painter(self) -> Painter:
-        """Make the painter; it opens a window."""
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """The fields that its colours read from a frame."""
+        return () if self.colors is None else self.colors.fields
+
+    def painter(self, shared: SharedGeometry | None = None) -> Painter:
+        """Make the painter; it opens a window. With several painters, `shared` keeps what their pictures share."""
         settings, scene, view, colors = self.settings, self.scene, self.view, self.colors
         theme = THEMES[settings.theme]
         if settings.mode == "density":
@@ -71,18 +76,20 @@ class RenderSetup:
             looks = (look if look.liquid else replace(look, finish="grains") for look in scene.appearances)
             return surface_painter(replace(scene, appearances=tuple(looks)), view, theme)
         if settings.mode == "surface":
-            return surface_painter(scene, view, theme, colors if isinstance(colors, Coloring) else None)
+            return surface_painter(scene, view, theme, colors if isinstance(colors, Coloring) else None, shared)
         assert colors is not None
         return DotsPainter(scene, view, theme, colors, int(self.result.particle_counts.max()))
 
 
-def surface_painter(scene: RenderScene, view: View, theme: Theme, colors: Coloring | None = None) -> Painter:
+def surface_painter(
+    scene: RenderScene, view: View, theme: Theme, colors: Coloring | None = None, shared: SharedGeometry | None = None
+) -> Painter:
     """Return the painter of smooth bodies: by triangles in 3D, by the density of particles in 2D."""
     if scene.dimension == 2:
         return OutlinePainter(scene, view, theme, colors)
     from mpmcli.render.surface_renderer import SurfaceRenderer
 
-    return SurfaceRenderer(scene, view, theme, colors)
+    return SurfaceRenderer(scene, view, theme, colors, shared)
 
 
 def set_up(result: Result, settings: Settings) -> RenderSetup:

@@ -16,7 +16,7 @@ from mpmcli.output.durable import sealed, write_text
 from mpmcli.output.result import Result, open_result
 from mpmcli.processes.pool import render_frames
 from mpmcli.render.particle_grid import FINENESS, Grid, blurred_along, cover_of, drawable, with_images
-from mpmcli.render.render_scene import RenderScene, groups_of, render_scene_of
+from mpmcli.render.render_scene import Group, RenderScene, SharedGeometry, groups_of, render_scene_of
 
 # Smoothing length of the kernel of splashsurf, in particle radii, fraction of the full density at the surface, and
 # rounds of Laplacian smoothing, weighted so that thin sheets keep their volume.
@@ -113,6 +113,18 @@ def reconstruct(
         triangles=triangles,
         normals=vertex_normals(vertices, triangles),
         attributes={name: np.asarray(surface.point_attributes[name])[order] for name in carried},
+    )
+
+
+def group_mesh(
+    scene: RenderScene, group: Group, attributes: Mapping[str, np.ndarray], shared: SharedGeometry, frame: Frame
+) -> Mesh:
+    """Return the surface of a group of a frame in 3D; see `reconstruct`."""
+    close = group.appearance.finish == "crumbly"
+    domain = scene.lower, scene.upper
+    key = ("mesh", group.key, *attributes)
+    return shared.once(
+        frame, key, lambda: reconstruct(group.position, group.distance, *domain, attributes, close=close)
     )
 
 

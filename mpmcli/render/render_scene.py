@@ -1,12 +1,12 @@
 """The scene of a picture: the domain of a run or of a scene, its materials, and groups of particles."""
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
@@ -27,6 +27,7 @@ from mpmcli.scene.expand import PRESETS
 from mpmcli.scene.expression import INITIAL, POSITION, VELOCITY, evaluate
 from mpmcli.scene.schema import usual_particles_per_cell
 
+T = TypeVar("T")
 # Kinds of shading: clear and thin, clear and thick, scattering inside, white crumbs, loose grains, bare metal, dull.
 Finish = Literal["water", "syrup", "translucent", "crumbly", "grains", "metal", "matte"]
 
@@ -218,6 +219,22 @@ def groups_of(scene: RenderScene, frame: Frame) -> list[Group]:
                 distance = float(distances[members].max())
                 groups.append(Group(key, appearance, rows, frame.position[rows].astype(np.float64), distance))
     return groups
+
+
+class SharedGeometry:
+    """Keeps what the images of one frame from several cameras have in common."""
+
+    def __init__(self) -> None:
+        self._frame: Frame | None = None
+        self._kept: dict[Hashable, Any] = {}
+
+    def once(self, frame: Frame, key: Hashable, make: Callable[[], T]) -> T:
+        """Return make(), called once for a frame and a key."""
+        if frame is not self._frame:
+            self._frame, self._kept = frame, {}
+        if key not in self._kept:
+            self._kept[key] = make()
+        return self._kept[key]
 
 
 @contextmanager

@@ -6,6 +6,8 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from mpmcli.cores import available_cores
 from mpmcli.errors import InputError
 from mpmcli.output.result import Result
@@ -13,6 +15,7 @@ from mpmcli.plain_text import counted
 from mpmcli.render.coloring import Coloring
 from mpmcli.render.frame_choice import choose_frames, evenly_spaced
 from mpmcli.render.picture_file import (
+    GIF_FPS_MAX,
     check_film,
     film_digest,
     require_writable,
@@ -35,7 +38,8 @@ from mpmcli.render.settings import Arrow, Colliders, Mode, Settings, parse_grid,
 from mpmcli.render.view import CAMERAS
 
 DIRECTORY = "render"  # directory of pictures in that of the result
-USUAL_FPS = 30.0
+# Frames of a film per second, least and most, that follow from the time between frames of the result; else USUAL_FPS.
+SLOWEST_FPS, FASTEST_FPS, USUAL_FPS = 10.0, 60.0, 30.0
 USUAL_MONTAGE_SIZE = "1280xauto"
 COLORED = ("dots", "surface")  # modes in which particles have the colours of a value
 
@@ -61,10 +65,27 @@ class Request:
     overwrite: bool = False
     arrows: tuple[Arrow, ...] | None = None
 
-    @property
-    def rate(self) -> float:
-        """Frames of a film per second."""
-        return USUAL_FPS if self.fps is None else self.fps
+    def rate_of(self, times: np.ndarray) -> float:
+        """Return the frames per second of a film of frames at these times, s: as given, or in real time if possible."""
+        pace = _pace(times)
+        if self.fps is not None:
+            return self.fps
+        fastest = GIF_FPS_MAX if self.movie is not None and self.movie.suffix.lower() == ".gif" else FASTEST_FPS
+        return round(pace, 6) if SLOWEST_FPS <= pace <= fastest else USUAL_FPS
+
+
+def _pace(times: np.ndarray) -> float:
+    """Return the frames per second of the scene's own time, 0 for frames without one."""
+    spans = np.abs(np.diff(times))
+    return 1 / float(np.median(spans)) if len(spans) and np.median(spans) > 0 else 0.0
+
+
+def speed_text(rate: float, times: np.ndarray) -> str:
+    """Return how fast a film of frames at these times, s, runs, in words."""
+    speed = rate / pace if (pace := _pace(times)) else 1.0
+    if abs(speed - 1) < 0.01:
+        return "in real time"
+    return f"1/{1 / speed:.3g} of real time" if speed < 1 else f"{speed:.3g} times real time"
 
 
 @dataclass(frozen=True)
@@ -75,6 +96,7 @@ class RenderSummary:
     made: int  # number of files drawn by this plan
     film: Path | None  # None for pictures only
     surfaces: Path | None  # the directory of the surfaces, None if not requested
+    speed: str  # of the film, in words; empty for pictures only
     warnings: list[str]  # sentences
 
     @property
@@ -85,7 +107,8 @@ class RenderSummary:
     def as_dict(self) -> dict[str, Any]:
         """Return it for JSON."""
         pictures, film = [str(path) for path in self.pictures], str(self.film) if self.film else None
-        return {"pictures": pictures, "made": self.made, "film": film, "warnings": self.warnings}
+        found = {"pictures": pictures, "made": self.made, "film": film, "warnings": self.warnings}
+        return found | ({"speed": self.speed} if film else {})
 
 
 @dataclass(frozen=True)
@@ -123,7 +146,8 @@ class RenderPlan:
         """
         workers = workers or available_cores()
         source, settings = self.setup.result.path, self.setup.settings
-        movie, surface, rate = self.request.movie, self.request.save_surface, self.request.rate
+        movie, surface, times = self.request.movie, self.request.save_surface, self.setup.result.times[self.ks]
+        rate = self.request.rate_of(times)
         outcomes: dict[int, Outcome] = {}
         numbers = count(1)
 
@@ -153,7 +177,8 @@ class RenderPlan:
             if self.request.overwrite or film_digest(movie) != digest:
                 write_film(paths, movie, rate, digest=digest, watch=check_stop)
         made = sum(not planned.made for planned in self.plan)
-        return RenderSummary(paths, made, movie, surface, self._warnings(outcomes))
+        speed = f"{rate:.4g} frames per second, {speed_text(rate, times)}" if movie else ""
+        return RenderSummary(paths, made, movie, surface, speed, self._warnings(outcomes))
 
     def _warnings(self, outcomes: dict[int, Outcome]) -> list[str]:
         """Return sentences on particles that could not be drawn, one for all frames."""
@@ -178,9 +203,9 @@ def plan_render(result: Result, request: Request, captions: tuple[str, ...] = ()
 
     `captions` are those of the frames of the result in a montage; empty for their times.
     """
-    _require_sense(request)
+    require_sense(request)
     if request.movie is not None:
-        check_film(request.movie, request.rate)
+        check_film(request.movie, USUAL_FPS if request.fps is None else request.fps)
         if film_digest(request.movie) == "" and not request.overwrite:
             raise InputError(FOREIGN.format(path=request.movie).replace("with -o", "with --movie"))
     grid = parse_grid(request.montage) if request.montage else (1, 1)
@@ -221,7 +246,7 @@ def plan_render(result: Result, request: Request, captions: tuple[str, ...] = ()
     return RenderPlan(setup, ks, plan, request)
 
 
-def _require_sense(request: Request) -> None:
+def require_sense(request: Request) -> None:
     """Refuse options that exclude each other, or have no effect in the mode."""
     if request.movie and request.montage:
         raise InputError("--movie and --montage exclude each other: give one of them.")

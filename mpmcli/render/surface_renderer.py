@@ -15,8 +15,8 @@ from mpmcli.render.coloring import Coloring
 from mpmcli.render.occlusion import Background, Occlusion, occlusion_by
 from mpmcli.render.offscreen import OffscreenRenderer
 from mpmcli.render.particle_grid import blurred_along, deposited
-from mpmcli.render.reconstruction import reconstruct
-from mpmcli.render.render_scene import Appearance, Group, RenderScene, groups_of
+from mpmcli.render.reconstruction import group_mesh
+from mpmcli.render.render_scene import Appearance, Group, RenderScene, SharedGeometry, groups_of
 from mpmcli.render.settings import Theme, rgb
 from mpmcli.render.view import View
 
@@ -33,8 +33,16 @@ JITTER = 0.3  # random displacement of a grain, in distances between particles, 
 class SurfaceRenderer:
     """Draws the materials of a 3D run as bodies against a lit background."""
 
-    def __init__(self, scene: RenderScene, view: View, theme: Theme, colors: Coloring | None = None) -> None:
+    def __init__(
+        self,
+        scene: RenderScene,
+        view: View,
+        theme: Theme,
+        colors: Coloring | None = None,
+        shared: SharedGeometry | None = None,
+    ) -> None:
         """Prepare the window, its background and the surfaces of colliders."""
+        self.shared = shared or SharedGeometry()
         self.scene, self.view, self.theme, self.colors = scene, view, theme, colors
         self.fields = () if colors is None else colors.fields
         self.background = Background(scene, view, theme)
@@ -54,7 +62,9 @@ class SurfaceRenderer:
         groups = groups_of(self.scene, frame)
         solids = [(mesh, shown) for mesh, shown in self.solids if self.scene.shows(mesh.number, frame)]
         shades = [mesh.shade(frame.time) for mesh, _ in solids if mesh.casts]
-        occlusion = occlusion_by(self.scene, groups, self.lamp, shades)
+        lamp = self.lamp
+        key = ("occlusion", *lamp.tolist())
+        occlusion = self.shared.once(frame, key, lambda: occlusion_by(self.scene, groups, lamp, shades))
         clear = []
         for actor in (*self.actors.values(), *chain(*self.rims.values())):
             actor.SetVisibility(False)
@@ -89,8 +99,7 @@ class SurfaceRenderer:
             values = np.asarray(self.colors.values(frame), dtype=np.float64)[group.rows]
             known = np.isfinite(values)
             attributes |= {"value": np.where(known, values, 0.0), "known": known.astype(np.float32)}
-        domain = self.scene.lower, self.scene.upper
-        mesh = reconstruct(group.position, group.distance, *domain, attributes, close=finish == "crumbly")
+        mesh = group_mesh(self.scene, group, attributes, self.shared, frame)
         if group.key not in self.actors:
             self.actors[group.key] = self._new_actor(group.appearance, by_field=self.colors is not None)
         tint = lighting.linear(group.appearance.color)
@@ -122,8 +131,7 @@ class SurfaceRenderer:
         light = 0.42 + 0.34 * lamp + 0.30 * sky
         light = light * (1.0 + VARIETY * hashes[:, 0] * np.abs(hashes[:, 0]) + 0.08 * hashes[:, 1])
         shown = np.clip(np.broadcast_to(color, hashes.shape) * light[:, None], 0.0, 1.0)
-        moved = group.position + JITTER * group.distance * group.hashes[:, ::-1]
-        cloud = pv.PolyData(np.clip(moved, self.scene.lower, self.scene.upper).astype(np.float32))
+        cloud = pv.PolyData(grain_places(self.scene, group).astype(np.float32))
         cloud.point_data["colors"] = (255.0 * shown + 0.5).astype(np.uint8)
         mapper = actor.GetMapper()
         mapper.SetInputData(cloud)
@@ -179,6 +187,12 @@ class SurfaceRenderer:
         shader.AddFragmentShaderReplacement("//VTK::TCoord::Impl", True, done, False)
         self.renderer.AddActor(actor)
         return actor
+
+
+def grain_places(scene: RenderScene, group: Group) -> np.ndarray:
+    """Return where the balls of grains are drawn, (n, 3), m."""
+    moved = group.position + JITTER * group.distance * group.hashes[:, ::-1]
+    return np.clip(moved, scene.lower, scene.upper)
 
 
 def _carry(

@@ -1,13 +1,14 @@
 """The camera, and the projection of points onto pixels."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mpmcli.errors import InputError
 from mpmcli.render.render_scene import RenderScene
+from mpmcli.scene.cameras import PlacedCamera
 
 if TYPE_CHECKING:
     import pyvista as pv
@@ -35,6 +36,9 @@ class View:
     parallel: bool  # parallel projection, for which a scale bar is valid
     near: float  # distances from the camera between which the domain lies, m
     far: float
+    lit: "View | None" = (
+        None  # the view whose lamps are used, so that several cameras see the same light; None: its own
+    )
 
     @property
     def distance(self) -> float:
@@ -201,11 +205,28 @@ def _free_view(scene: RenderScene, camera: str, size: tuple[int, int]) -> View:
     back, up = position - focus, np.array(scene.up)
     if np.linalg.norm(back) <= 1e-9 * max(np.abs(numbers).max(), 1e-300):
         raise InputError(f"{what}: its position and its target are equal.")
-    if np.linalg.norm(np.cross(back, up)) <= 1e-6 * np.linalg.norm(back):
-        # For a vertical line of sight any other direction serves as the upward one.
-        up = np.eye(3)[(int(np.argmax(np.abs(up))) + 1) % 3]
+    up = _upright(back, up)
     height = 2 * math.tan(math.radians(0.5 * ANGLE)) * float(np.linalg.norm(back))
     return _view(scene, size, (position, focus, up), height, parallel=False)
+
+
+def view_of_camera(scene: RenderScene, camera: PlacedCamera, time: float) -> View:
+    """Return the view of a camera of a scene at a time, s, lit as from "iso"; InputError: position is target."""
+    position, focus = camera.pose(time)
+    back, up = position - focus, np.array(camera.up)
+    distance = float(np.linalg.norm(back))
+    if not distance > 1e-9 * max(np.abs([position, focus]).max(), 1e-300):
+        raise InputError(f'camera "{camera.name}" is at its target at {time:.4g} s: move one of them.')
+    height = camera.height if camera.focal is None else camera.size[1] / camera.focal * distance
+    view = _view(scene, camera.size, (position, focus, _upright(back, up)), height, parallel=camera.focal is None)
+    return replace(view, lit=view_of(scene, "iso", camera.size))
+
+
+def _upright(back: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """Return the upward direction, or another one along an axis for a vertical line of sight."""
+    if np.linalg.norm(np.cross(back, up)) > 1e-6 * np.linalg.norm(back) * np.linalg.norm(up):
+        return up
+    return np.eye(3)[(int(np.argmax(np.abs(up))) + 1) % 3]
 
 
 def _view(

@@ -7,6 +7,7 @@ from typing import get_args
 import numpy as np
 
 from mpmcli.scene.bounds import body_places
+from mpmcli.scene.cameras import camera_problems
 from mpmcli.scene.colliders import Collider, Plane, has_jump, slope_of
 from mpmcli.scene.domain import OPEN, SEPARATING, STICKING
 from mpmcli.scene.entry import entries_in, tree_of, value_of, varies
@@ -241,7 +242,8 @@ def problems_in(scene: Scene) -> list[Problem]:
     colliding = [] if outside or empty else list(collider_problems(scene))
     where = [*_repeated_names(scene), *outside, *_overlaps(scene), *empty, *_too_large_to_relax(scene)]
     found = [*where, *unstarted, *colliding, *_pushed(scene), *_paired(scene), *_unstored(scene), *_total(scene)]
-    return [*found, *gravity_problems(scene), *emitter_problems(scene)]
+    seen = camera_problems(scene.cameras, scene.time.end)
+    return [*found, *gravity_problems(scene), *emitter_problems(scene), *seen]
 
 
 def _repeated_names(scene: Scene) -> Iterator[Problem]:

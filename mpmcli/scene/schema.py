@@ -13,6 +13,7 @@ from pydantic import (
     model_validator,
 )
 
+from mpmcli.scene.cameras import Camera
 from mpmcli.scene.colliders import Collider
 from mpmcli.scene.domain import Domain
 from mpmcli.scene.entry import ConstantTable, OfTime, StartDeformation, StartMatrix, StartVector
@@ -355,6 +356,7 @@ class Scene(Table):
     contact: Contact = Field(Contact(), description='Contact between bodies. Default: "auto".')
     output: Output = Field(Output(), description="Stored fields and format.")
     error_bars: ErrorBars | None = Field(None, description="Error bars after the run. Default: none.")
+    cameras: tuple[Camera, ...] = Field((), description="Cameras of `mpmcli render --cameras`. Default: none.")
     solver: SolverSettings = Field(SolverSettings(), description="Numerical method.")
 
     @model_validator(mode="after")
