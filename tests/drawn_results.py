@@ -60,11 +60,7 @@ def header(
 
 
 def frame(
-    k: int,
-    position: np.ndarray,
-    body: np.ndarray | int = 0,
-    velocity: np.ndarray | None = None,
-    **fields: np.ndarray,
+    k: int, position: np.ndarray, body: np.ndarray | int = 0, velocity: np.ndarray | None = None, **fields: np.ndarray
 ) -> Frame:
     """Frame k, at t = k/100 s."""
     position = np.asarray(position, dtype=np.float32)

@@ -40,14 +40,7 @@ def body_scene(
         time={"end": end, "frames": frames, "safety": safety},
         solver={"solids": "total", "precision": precision},
         output={"fields": ["velocity", "initial_position"]},
-        bodies=[
-            {
-                "name": "body",
-                "material": material or jelly(),
-                "shape": {"box": {"min": low, "max": high}},
-                **more,
-            }
-        ],
+        bodies=[{"name": "body", "material": material or jelly(), "shape": {"box": {"min": low, "max": high}}, **more}],
     )
 
 

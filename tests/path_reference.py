@@ -41,12 +41,7 @@ def reference_groups(scene: Scene, arrays: Arrays, k: int) -> list[reference.Par
 
 
 def check_nodes(
-    nodes: np.ndarray,
-    momentum: np.ndarray,
-    mass: np.ndarray,
-    velocity: np.ndarray,
-    fall: np.ndarray,
-    tolerance: float,
+    nodes: np.ndarray, momentum: np.ndarray, mass: np.ndarray, velocity: np.ndarray, fall: np.ndarray, tolerance: float
 ) -> None:
     """Compare the momentum and the mass that P2G left, where no wall folds, and every node's velocity.
 

@@ -80,12 +80,7 @@ def restart(run: Run, samples: Sequence[BodyParticles], end: float) -> None:
 
 
 def volume_errors(
-    x: np.ndarray,
-    volume: np.ndarray,
-    flows: np.ndarray,
-    spacing: float,
-    cells: Sequence[int],
-    periodic: Sequence[bool],
+    x: np.ndarray, volume: np.ndarray, flows: np.ndarray, spacing: float, cells: Sequence[int], periodic: Sequence[bool]
 ) -> np.ndarray:
     """Return the volume errors of (T, n, d) places, the particles added in two parts, which change no bit."""
     halves, whole = (FilledCells(x, spacing, cells, periodic) for _ in range(2))

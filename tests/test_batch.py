@@ -39,11 +39,7 @@ SCENES = (
         "rough walls, total": (("neo_hookean",), 2, {"solver": {"solids": "total"}}),
         "periodic, a wall moves": (("fluid",), 2, {"domain": REPEATING}),
         "periodic, a wall moves, AFLIP": (("sand",), 2, {"domain": REPEATING, "solver": {"transfer": "aflip"}}),
-        "periodic, 3D, f_bar": (
-            ("neo_hookean",),
-            3,
-            {"domain": DOUBLY_REPEATING, "solver": {"f_bar": True}},
-        ),
+        "periodic, 3D, f_bar": (("neo_hookean",), 3, {"domain": DOUBLY_REPEATING, "solver": {"f_bar": True}}),
         "colliders": (("sand",), 2, {"colliders": True}),
         "colliders, 3D": (("neo_hookean",), 3, {"colliders": True}),
         "contact": (("neo_hookean", "fixed_corotated", "fluid", "snow"), 2, {"contact": 0.3, "colliders": True}),
@@ -104,10 +100,7 @@ def rigid(dimension: int, k: int) -> list[dict]:
 
 # In the default suite, with the runs that are repeated alone: the second is smaller than what the batch has room for.
 # All others, and the first runs of these, carry the marker slow.
-USUAL = {
-    "two laws, two bodies of one": (1,),
-    "rigid bodies": (1,),
-}
+USUAL = {"two laws, two bodies of one": (1,), "rigid bodies": (1,)}
 Output = list[tuple[Frame, LedgerRow]]
 
 

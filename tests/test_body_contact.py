@@ -467,11 +467,7 @@ def test_single_precision_bears_nodes_of_hardly_any_mass(backend_of: Callable) -
 
 
 def thrown(
-    mirrored: bool = False,
-    turned: bool = False,
-    names: str = "abc",
-    safety: float = 0.8,
-    contact: dict | None = None,
+    mirrored: bool = False, turned: bool = False, names: str = "abc", safety: float = 0.8, contact: dict | None = None
 ) -> Scene:
     """Boxes that meet in the air at a third of their wave speed; `turned`: in another order."""
 

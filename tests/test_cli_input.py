@@ -128,10 +128,7 @@ def test_a_backend_that_is_not_there_is_refused(refused, monkeypatch):
     ("arguments", "sentence"),
     [
         (["simulat"], 'there is no command "simulat"; did you mean "simulate"? See mpmcli --help.'),
-        (
-            ["paint"],
-            'there is no command "paint"; the commands are new, check, simulate, materials, info, ',
-        ),
+        (["paint"], 'there is no command "paint"; the commands are new, check, simulate, materials, info, '),
         (["--verbose"], "no such option '--verbose'"),
         (["simulate"], "missing argument 'SCENE'. See mpmcli simulate --help."),
         (["simulate", "a.toml", "b.toml"], "got unexpected extra argument (b.toml). See mpmcli simulate --help."),

@@ -127,9 +127,7 @@ def sand_on(degrees: float) -> tuple[Scene, np.ndarray]:
         domain={"size": [1.4, 1.4], "spacing": h, "gravity": [0.0, -G]},
         time={"end": 0.6, "frames": 6},
         bodies=[{"name": "s", "material": sand, "shape": {"polygon": {"vertices": [list(c) for c in corners]}}}],
-        colliders=[
-            {"name": "p", "shape": {"plane": {"point": list(start), "normal": list(normal)}}, "wall": "stick"},
-        ],
+        colliders=[{"name": "p", "shape": {"plane": {"point": list(start), "normal": list(normal)}}, "wall": "stick"}],
     )
     return scene, down
 

@@ -288,11 +288,7 @@ def block_on_plane(
             }
         ],
         colliders=[
-            {
-                "name": "slope",
-                "shape": {"plane": {"point": list(point), "normal": list(normal)}},
-                "friction": friction,
-            }
+            {"name": "slope", "shape": {"plane": {"point": list(point), "normal": list(normal)}}, "friction": friction}
         ],
     )
     return scene, down, normal

@@ -39,11 +39,7 @@ def syringe(
         time={"end": 0.5, "frames": 1},
         bodies=[{"name": "body", "material": material, "shape": tube(0.2 + gap, 0.4, 0.1) | bore}],
         colliders=[
-            {
-                "name": "barrel",
-                "wall": wall,
-                "shape": tube(-0.2, 0.9, 0.4) | {"subtract": barrel},
-            },
+            {"name": "barrel", "wall": wall, "shape": tube(-0.2, 0.9, 0.4) | {"subtract": barrel}},
             {"name": "piston", "shape": tube(-0.3, 0.2, 0.1), **(motion or {"velocity": [U] + [0.0] * (d - 1)})},
         ],
     )

@@ -69,8 +69,7 @@ def test_draws_follow_their_distribution(text, share, method):
 
 
 @pytest.mark.parametrize(
-    ("text", "values"),
-    [("integers = [2, 6]", [2, 3, 4, 5, 6]), ("choice = [1, 4, 16]", [1, 4, 16])],
+    ("text", "values"), [("integers = [2, 6]", [2, 3, 4, 5, 6]), ("choice = [1, 4, 16]", [1, 4, 16])]
 )
 def test_every_value_is_as_likely(text, values):
     found = drawn(sweep_of(varied(f'"time.frames" = {{ {text} }}')), "time.frames")

@@ -261,8 +261,7 @@ def test_rigid_bodies_alone_are_exported_where_they_can_be(tmp_path, form, dimen
         pose = ((*[0.5] * (dimension - 1), 0.5 - 0.1 * k, *turn),)
         motion = ((0.0,) * (3 * dimension - 3),)
         store.write(
-            drawn(k, np.empty((0, dimension))),
-            replace(row(0.01 * k, dimension), rigid_pose=pose, rigid_motion=motion),
+            drawn(k, np.empty((0, dimension))), replace(row(0.01 * k, dimension), rigid_pose=pose, rigid_motion=motion)
         )
     store.finish()
     outcome = run_here("export", tmp_path / "run", "--to", form, "-o", tmp_path / "out")

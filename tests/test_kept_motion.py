@@ -166,8 +166,7 @@ def test_bodies_that_meet_lose_as_much_at_any_step(
 
 
 @pytest.mark.parametrize(
-    "name",
-    [pytest.param(f"{name}_blocks", marks=pytest.mark.slow) for name in ("metal", "paste", "snow", "sand")],
+    "name", [pytest.param(f"{name}_blocks", marks=pytest.mark.slow) for name in ("metal", "paste", "snow", "sand")]
 )
 def test_plastic_flow_is_as_far_at_any_step(backend_of: Callable, name: str) -> None:
     """The known stress of blocks in homogeneous motion, in steps of 1, 1/5 and 1/50: waves from faces disturb it."""

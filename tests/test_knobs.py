@@ -60,10 +60,7 @@ def test_flip_belongs_to_aflip() -> None:
         small_scene(transfer="aflip", flip=1.5)
 
 
-@pytest.mark.parametrize(
-    ("key", "value", "right"),
-    [("kernel", "linear", "cubic"), ("transfer", "flip", "aflip")],
-)
+@pytest.mark.parametrize(("key", "value", "right"), [("kernel", "linear", "cubic"), ("transfer", "flip", "aflip")])
 def test_other_words_are_refused(key: str, value: str, right: str) -> None:
     with pytest.raises(InputError, match=rf"solver\.{key}.*{right}"):
         small_scene(**{key: value})
@@ -76,9 +73,7 @@ def test_the_effective_scene_says_every_knob() -> None:
 
 
 @pytest.mark.parametrize(
-    "knobs",
-    [{}, {"kernel": "cubic"}, {"transfer": "aflip"}],
-    ids=lambda knobs: "-".join(knobs.values()) or "usual",
+    "knobs", [{}, {"kernel": "cubic"}, {"transfer": "aflip"}], ids=lambda knobs: "-".join(knobs.values()) or "usual"
 )
 def test_the_plan_follows_the_knobs(backend_of: Callable, knobs: dict) -> None:
     """Nodes, their bytes and the passes, counted from the solver's own fields."""

@@ -83,10 +83,7 @@ def test_a_wave_loses_what_check_says(knobs: dict) -> None:
 
 @pytest.mark.parametrize(
     "knobs",
-    [
-        {"kernel": "cubic"},
-        pytest.param({"transfer": "aflip", "flip": 1.0}, marks=pytest.mark.slow),
-    ],
+    [{"kernel": "cubic"}, pytest.param({"transfer": "aflip", "flip": 1.0}, marks=pytest.mark.slow)],
     ids=name_of,
 )
 def test_a_lone_particle_blows_up_at_the_bound(backend_of: Callable, knobs: dict) -> None:

@@ -73,13 +73,7 @@ def check_steps(scene: Scene, arrays: Arrays, tolerance: float) -> None:
 
 @pytest.mark.parametrize(
     ("dimension", "knobs"),
-    [
-        (2, AFLIP),
-        slowly(2, CUBIC),
-        slowly(2, AFLIP | CUBIC),
-        slowly(3, CUBIC),
-        slowly(3, AFLIP | CUBIC),
-    ],
+    [(2, AFLIP), slowly(2, CUBIC), slowly(2, AFLIP | CUBIC), slowly(3, CUBIC), slowly(3, AFLIP | CUBIC)],
     ids=name_of,
 )
 def test_steps_match_plain_numpy(backend_of: Callable, dimension: int, knobs: dict) -> None:

@@ -39,12 +39,7 @@ def lone_particles(dimension: int) -> object:
         bodies=[
             {
                 "name": "solid",
-                "material": {
-                    "law": "neo_hookean",
-                    "density": RHO,
-                    "youngs_modulus": E,
-                    "poissons_ratio": NU,
-                },
+                "material": {"law": "neo_hookean", "density": RHO, "youngs_modulus": E, "poissons_ratio": NU},
                 "shape": cell(0.32),
                 **side,
             },

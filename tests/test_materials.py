@@ -37,13 +37,7 @@ class Case:
 CASES = {
     "fluid": Case({"bulk_modulus": 2e5, "exponent": 7.0, "tension_cutoff": False}, 2e5),
     "viscoplastic": Case(
-        {
-            "bulk_modulus": 2e5,
-            "shear_modulus": 5e4,
-            "yield_stress": 1e3,
-            "consistency": 5.0,
-            "tension_cutoff": False,
-        },
+        {"bulk_modulus": 2e5, "shear_modulus": 5e4, "yield_stress": 1e3, "consistency": 5.0, "tension_cutoff": False},
         2e5,
         5e-3,
         plane=False,

@@ -99,11 +99,7 @@ def test_the_plan_counts_what_the_host_holds(tmp_path: Path, fields: list[str]) 
         time={"end": 4e-6, "frames": 2, "step": 2e-6},
         solver={"precision": "f32"},
         bodies=[
-            {
-                "name": "block",
-                "material": MATERIALS["fluid"],
-                "shape": {"box": {"min": [0.2, 0.2], "max": [0.6, 0.6]}},
-            }
+            {"name": "block", "material": MATERIALS["fluid"], "shape": {"box": {"min": [0.2, 0.2], "max": [0.6, 0.6]}}}
         ],
         output={"fields": fields},
     )
@@ -288,7 +284,6 @@ def test_a_device_is_there_if_the_driver_says_so(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr("mpmcli.solver.machine.backend.os.path.exists", lambda name: False)
     for present in (True, False):
         monkeypatch.setattr(
-            "mpmcli.solver.machine.backend.ctypes.CDLL",
-            lambda name, present=present: FakeDriver(1, present=present),
+            "mpmcli.solver.machine.backend.ctypes.CDLL", lambda name, present=present: FakeDriver(1, present=present)
         )
         assert has_cuda_device() is present

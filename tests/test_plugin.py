@@ -179,18 +179,12 @@ def test_several_plugins_make_several_laws():
 # What is replaced in the law, by what, and what is said.
 FAULTS = {
     "no LAW": (("LAW = LogFluid", ""), "law.py: the file defines no LAW; end it with LAW = YourLaw"),
-    "no class": (
-        ("LAW = LogFluid", "LAW = 3"),
-        "law.py: LAW must be a subclass of mpmcli.materials.law.Law; found 3",
-    ),
+    "no class": (("LAW = LogFluid", "LAW = 3"), "law.py: LAW must be a subclass of mpmcli.materials.law.Law; found 3"),
     "another class": (
         ("LAW = LogFluid", "LAW = LogFluidParameters"),
         "law.py: LAW must be a subclass of mpmcli.materials.law.Law; found <class 'mpmcli_plugin_0_law.LogFluidParam",
     ),
-    "name taken": (
-        ("log_fluid", "fluid"),
-        'law.py: "fluid" is the name of a law of mpmcli; give LAW another name',
-    ),
+    "name taken": (("log_fluid", "fluid"), 'law.py: "fluid" is the name of a law of mpmcli; give LAW another name'),
     "two names": (
         ('name = "log_fluid"', 'name = "other"'),
         "law.py: LogFluid.name is \"other\", and law in its parameters is 'log_fluid'; both must be the same word",

@@ -20,11 +20,7 @@ H = 0.05
 LIGHT = THEMES["light"]
 FILL = np.array(rgb_bytes(LIGHT.ground)) * (1 - FILLED) + FILLED * np.array(rgb_bytes(LIGHT.solid))
 TANK = {"name": "tank", "side": "inside", "shape": {"ball": {"center": [0.5, 0.5], "radius": 0.45}}}
-ROD = {
-    "name": "rod",
-    "shape": {"box": {"min": [0.3, 0.55], "max": [0.7, 0.65]}},
-    "angular_velocity": float(50 * np.pi),
-}
+ROD = {"name": "rod", "shape": {"box": {"min": [0.3, 0.55], "max": [0.7, 0.65]}}, "angular_velocity": float(50 * np.pi)}
 
 
 def drawn(result: Result, mode: str, k: int = 0, camera: str = "front", **more: Any) -> tuple[np.ndarray, View]:

@@ -35,12 +35,7 @@ from mpmcli.solver.machine.backend import choose_backend, start, stop_backend
 
 # Sand, water from an emitter, a paddle that turns ever faster, gravity that swings, an open face.
 CHANGING = {
-    "domain": {
-        "size": [1.0, 1.0],
-        "cells": [20, 20],
-        "gravity": ["2*sin(9*t)", -9.81],
-        "walls": {"y_max": "open"},
-    },
+    "domain": {"size": [1.0, 1.0], "cells": [20, 20], "gravity": ["2*sin(9*t)", -9.81], "walls": {"y_max": "open"}},
     "time": {"end": 0.4, "frames": 7},
     "output": {"fields": ["velocity", "density"]},
     "bodies": [

@@ -94,11 +94,7 @@ def discs(dimension: int, speed: float, density: float = 1000.0, **domain: objec
             }
         ],
         colliders=[
-            {
-                "name": "other",
-                "density": density,
-                "shape": {"ball": {"center": [0.48, 0.4, *tail], "radius": radius}},
-            }
+            {"name": "other", "density": density, "shape": {"ball": {"center": [0.48, 0.4, *tail], "radius": radius}}}
         ],
         contact={},
         output={"fields": ["velocity", "stress"]},

@@ -158,11 +158,7 @@ def status_on_disk(directory: Path) -> str:
 
 @pytest.mark.parametrize(
     ("fault", "status", "frames"),
-    [
-        (None, "finished", 3),
-        (KeyboardInterrupt(), "interrupted", 2),
-        (RunError("The disk is full."), "failed", 2),
-    ],
+    [(None, "finished", 3), (KeyboardInterrupt(), "interrupted", 2), (RunError("The disk is full."), "failed", 2)],
     ids=["nothing", "Ctrl-C", "disk"],
 )
 def test_a_run_ends_in_order_whatever_happens(run, tmp_path, fault, status, frames):

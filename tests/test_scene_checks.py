@@ -46,10 +46,7 @@ TOUCHING = {
     "boxes, up to round-off": (box(0, 0, 0.3, 1), box(0.1 + 0.2, 0, 2, 1), box(0.1 * 3, 1, 2, 2)),
     "box and ball": (box(0, 0, 1, 1), ball(1.5, 0.5, radius=0.5)),
     "balls": (ball(1, 1, radius=0.5), ball(1 + math.sqrt(0.5), 1 + math.sqrt(0.5), radius=0.5)),
-    "ball in a notch": (
-        polygon((0, 0), (2, 0), (1, 1), (2, 2), (0, 2)),
-        ball(2.0, 1.0, radius=math.sqrt(0.5)),
-    ),
+    "ball in a notch": (polygon((0, 0), (2, 0), (1, 1), (2, 2), (0, 2)), ball(2.0, 1.0, radius=math.sqrt(0.5))),
     "triangles of a square": (polygon((0, 0), (2, 0), (2, 2)), polygon((0, 0), (2, 2), (0, 2))),
     "cylinder on a box": (box(0, 0, 0, 1, 1, 1), cylinder([0.5, 0.5, 1], [0, 0, 1], 0.5, 1)),
 }

@@ -10,14 +10,7 @@ from hypothesis import strategies as st
 from pydantic import create_model
 
 from mpmcli.materials.registry import parameter_models
-from mpmcli.scene import (
-    estimate_particles,
-    json_schema,
-    load_scene,
-    parse_scene,
-    sample_bodies,
-    scene_to_toml,
-)
+from mpmcli.scene import estimate_particles, json_schema, load_scene, parse_scene, sample_bodies, scene_to_toml
 from mpmcli.scene.expand import PRESETS
 from mpmcli.scene.quantity import Table
 from mpmcli.scene.schema import scene_model
@@ -41,12 +34,7 @@ def materials(draw):
         modulus = draw(st.one_of(st.just("auto"), st.floats(1e-3, 1e12)))
         return {"law": "fluid", "density": draw(st.floats(1e-3, 1e5)), "bulk_modulus": modulus}
     ratio = draw(st.floats(0, 0.49, allow_subnormal=False))
-    return {
-        "law": "neo_hookean",
-        "density": 1.0,
-        "youngs_modulus": draw(st.floats(1, 1e12)),
-        "poissons_ratio": ratio,
-    }
+    return {"law": "neo_hookean", "density": 1.0, "youngs_modulus": draw(st.floats(1, 1e12)), "poissons_ratio": ratio}
 
 
 @st.composite
@@ -190,11 +178,7 @@ def test_long_lists_are_one_entry_a_line():
         "domain": {"size": [1, 1], "spacing": 0.1},
         "time": {"end": 1, "frames": 1},
         "bodies": [
-            {
-                "name": "saw",
-                "material": {"law": "fluid", "density": 1},
-                "shape": {"polygon": {"vertices": vertices}},
-            }
+            {"name": "saw", "material": {"law": "fluid", "density": 1}, "shape": {"polygon": {"vertices": vertices}}}
         ],
     }
     text = scene_to_toml(parse_scene(data, laws=LAWS).scene)

@@ -67,10 +67,7 @@ def test_later_overrides_see_earlier_ones():
         ("time..end=3", '"time..end" is not a key; a key is a path such as time.end or bodies[0].velocity'),
         ("time.end=", "nothing is not a TOML value; write a number, a list or a word, or text in quotes"),
         ("time.end=[1", "[1 is not a TOML value; write a number, a list or a word, or text in quotes"),
-        (
-            "time.end=1\ntitle=2",
-            "1\ntitle=2 is not a TOML value; write a number, a list or a word, or text in quotes",
-        ),
+        ("time.end=1\ntitle=2", "1\ntitle=2 is not a TOML value; write a number, a list or a word, or text in quotes"),
         ("bodies.colum.velocity=1", 'no entry of bodies has the name "colum"; did you mean "column"?'),
         ("bodies.x.velocity=1", 'no entry of bodies has the name "x"; the names are column'),
         ("bodies.1.velocity=1", "bodies has 1 entry, counted from 0; there is no bodies[1]"),

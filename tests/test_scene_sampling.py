@@ -59,10 +59,7 @@ def test_in_3d_27_particles_per_cell():
 )
 def test_a_box_of_any_size_is_filled_evenly(lower, extent, jittered):
     upper = [lo + e for lo, e in zip(lower, extent, strict=True)]
-    body = {
-        "shape": {"box": {"min": list(lower), "max": upper}},
-        "sampling": "jittered" if jittered else "lattice",
-    }
+    body = {"shape": {"box": {"min": list(lower), "max": upper}}, "sampling": "jittered" if jittered else "lattice"}
     scene = scene_of(body)
     (particles,) = sample_bodies(scene)
     assert particles.count == estimate_particles(scene)
@@ -78,10 +75,7 @@ SHAPES = {
     "disc": ((4, 4), DISC),
     "polygon": ((4, 4), {"polygon": {"vertices": [[0.5, 0.5], [3, 1], [2, 3]]}}),
     "ball": ((2, 2, 2), {"ball": {"center": [1, 1, 1], "radius": 0.7}}),
-    "cylinder": (
-        (2, 2, 2),
-        {"cylinder": {"base": [0.5, 0.5, 0.5], "axis": [1, 1, 1], "radius": 0.4, "height": 1}},
-    ),
+    "cylinder": ((2, 2, 2), {"cylinder": {"base": [0.5, 0.5, 0.5], "axis": [1, 1, 1], "radius": 0.4, "height": 1}}),
 }
 
 
@@ -111,11 +105,7 @@ def test_a_disc_on_a_lattice_is_symmetric():
 @pytest.mark.parametrize("count", [3, 5, 7])
 def test_jittered_takes_any_number_per_cell(count):
     scene = scene_of(
-        {
-            "shape": {"box": {"min": [0, 0], "max": [3.0, 3.0]}},
-            "sampling": "jittered",
-            "particles_per_cell": count,
-        }
+        {"shape": {"box": {"min": [0, 0], "max": [3.0, 3.0]}}, "sampling": "jittered", "particles_per_cell": count}
     )
     (particles,) = sample_bodies(scene)
     assert particles.count == pytest.approx(900 * count, rel=0.02)

@@ -21,11 +21,7 @@ FIELD_NAMES = quoted(
 
 # What is replaced in GOOD, by what, and the one line that answers.
 REPLACED = [
-    (
-        "density = 1000.0",
-        "densty = 1000.0",
-        '11: bodies[0].material.densty: unknown key; did you mean "density"?',
-    ),
+    ("density = 1000.0", "densty = 1000.0", '11: bodies[0].material.densty: unknown key; did you mean "density"?'),
     (
         "end = 1.5",
         "end = 1.5\nduration = 3",
@@ -50,28 +46,12 @@ REPLACED = [
         '8: time.step: must be a number or "auto"; found "atuo"; did you mean "auto"?',
     ),
     ("end = 1.5", "end = 1\nsafety = 0", "8: time.safety: must be greater than 0; found 0"),
-    (
-        "end = 1.5",
-        "end = 1e16",
-        "7: time.end: is beyond what can be computed with, 1e+15 at most; found 1e+16",
-    ),
-    (
-        "end = 1.5",
-        "end = 1e-16",
-        "7: time.end: is below what can be computed with, 1e-15 at least; found 1e-16",
-    ),
+    ("end = 1.5", "end = 1e16", "7: time.end: is beyond what can be computed with, 1e+15 at most; found 1e+16"),
+    ("end = 1.5", "end = 1e-16", "7: time.end: is below what can be computed with, 1e-15 at least; found 1e-16"),
     ("frames = 150", "frames = 0", "8: time.frames: must be at least 1; found 0"),
     ("frames = 150", "frames = 1.5", "8: time.frames: must be a whole number; found 1.5"),
-    (
-        "density = 1000.0",
-        "density = -1000.0",
-        "11: bodies[0].material.density: must be greater than 0; found -1000.0",
-    ),
-    (
-        "density = 1000.0",
-        'density = "1000"',
-        '11: bodies[0].material.density: must be a number; found "1000"',
-    ),
+    ("density = 1000.0", "density = -1000.0", "11: bodies[0].material.density: must be greater than 0; found -1000.0"),
+    ("density = 1000.0", 'density = "1000"', '11: bodies[0].material.density: must be a number; found "1000"'),
     (
         "youngs_modulus = 1e5\n",
         "",
@@ -113,11 +93,7 @@ REPLACED = [
         "3: domain.size: must be a whole number of cells of spacing 0.03 m: 4 m is 133.333 cells along x, "
         "3.99 or 4.02 m would fit; 2 m is 66.6667 cells along y, 1.98 or 2.01 m would fit",
     ),
-    (
-        "spacing = 0.02\n",
-        "",
-        '2: domain: missing key "spacing" (m), or "cells" (a number per axis) in its place',
-    ),
+    ("spacing = 0.02\n", "", '2: domain: missing key "spacing" (m), or "cells" (a number per axis) in its place'),
     (
         "spacing = 0.02",
         "spacing = 0.02\ncells = [200, 100]",
@@ -207,11 +183,7 @@ REPLACED = [
         '15: bodies[1].shape: body "drop" overlaps body "column", for example at [0.702459, 0.9525]; '
         "bodies may touch but not overlap",
     ),
-    (
-        '"drop"',
-        '"column"',
-        '14: bodies[1].name: "column" is the name of bodies[0] already; every body needs its own',
-    ),
+    ('"drop"', '"column"', '14: bodies[1].name: "column" is the name of bodies[0] already; every body needs its own'),
     (
         '"drop"',
         '"a.b"',
@@ -255,11 +227,7 @@ REPLACED = [
         "spacing =",
         "4:10: not valid TOML: this is not a TOML value; text needs quotes, numbers and lists none",
     ),
-    (
-        "box = { min",
-        "box = {\nmin",
-        "12:18: not valid TOML: expected a key; a table in { } stands on one line",
-    ),
+    ("box = { min", "box = {\nmin", "12:18: not valid TOML: expected a key; a table in { } stands on one line"),
     ("spacing = 0.02", "spacing 0.02", "4:9: not valid TOML: expected key = value"),
     (
         '[[bodies]]\nname = "drop"',

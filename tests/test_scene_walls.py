@@ -14,9 +14,7 @@ def scene(cells: int = 10, solver: dict | None = None, **domain: object) -> Scen
         domain={"size": [0.1 * cells, 1.0], "spacing": 0.1, **domain},
         time={"end": 1.0, "frames": 1},
         solver=solver or {},
-        bodies=[
-            {"name": "rod", "material": ROD, "shape": {"box": {"min": [0.0, 0.0], "max": [0.1 * cells, 0.5]}}},
-        ],
+        bodies=[{"name": "rod", "material": ROD, "shape": {"box": {"min": [0.0, 0.0], "max": [0.1 * cells, 0.5]}}}],
     )
 
 

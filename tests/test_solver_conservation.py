@@ -31,12 +31,7 @@ def free_scene(dimension: int, precision: str, gravity: list[float] | None = Non
             spin[j, i] = -spin[i, j]
     middle = [size / 2] * (d - 1)
     return scene_of(
-        domain={
-            "size": [size] * d,
-            "spacing": H,
-            "origin": [-0.4] * d,
-            **({"gravity": gravity} if gravity else {}),
-        },
+        domain={"size": [size] * d, "spacing": H, "origin": [-0.4] * d, **({"gravity": gravity} if gravity else {})},
         time={"end": 1.0, "frames": 1},
         # A shift changes momenta, by what is of second order in its way (test_redistribution.py).
         solver={"precision": precision, "redistribute": False},
@@ -186,9 +181,7 @@ def test_affine_fields_are_transferred_exactly(spinning: Callable, dimension: in
         offset = sample.position - sample.position.mean(0)
         bodies.append(
             replace(
-                sample,
-                velocity=random.normal(0, 1, dimension) + offset @ L.T,
-                affine=np.tile(L, (sample.count, 1, 1)),
+                sample, velocity=random.normal(0, 1, dimension) + offset @ L.T, affine=np.tile(L, (sample.count, 1, 1))
             )
         )
     run = spinning("f64", dimension, bodies)

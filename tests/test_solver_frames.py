@@ -17,16 +17,7 @@ from mpmcli.solver.frames.columns import FrameArrays, FrameColumns, RunConstants
 from mpmcli.solver.frames.diagnosis import read_group
 
 H = 0.1
-FIELDS = [
-    "velocity",
-    "density",
-    "pressure",
-    "volume_ratio",
-    "deformation_gradient",
-    "affine",
-    "stress",
-    "mass",
-]
+FIELDS = ["velocity", "density", "pressure", "volume_ratio", "deformation_gradient", "affine", "stress", "mass"]
 E, NU, K = 2e4, 0.3, 3e4
 GRAVITY = [0.3, -9.81]
 Frames = list[tuple[Frame, LedgerRow]]
@@ -50,12 +41,7 @@ def tumbling() -> Scene:
             {"name": "a", "material": fluid, "shape": box(10.1, -4.8), "velocity": [2.0, 0.0]},
             {"name": "b", "material": solid, "shape": box(10.7, -4.6), "velocity_gradient": spin},
             {"name": "c", "material": {**fluid, "density": 500.0}, "shape": box(11.6, -4.7)},
-            {
-                "name": "d",
-                "material": {**solid, "density": 400.0},
-                "shape": box(12.4, -4.8),
-                "velocity": [-2.0, 1.0],
-            },
+            {"name": "d", "material": {**solid, "density": 400.0}, "shape": box(12.4, -4.8), "velocity": [-2.0, 1.0]},
         ],
     )
 

@@ -34,11 +34,7 @@ USUAL = ("total", "forces", "contact")
 def test_a_loaded_run_has_the_bytes_of_one_that_went_on(threads: int, names: tuple[str, ...]) -> None:
     """Save, 50 steps, load, 50 steps; and the same in another run of the scene, by a route through JSON."""
     done = subprocess.run(
-        [sys.executable, str(RUN), str(threads), *names],
-        capture_output=True,
-        text=True,
-        timeout=600,
-        check=True,
+        [sys.executable, str(RUN), str(threads), *names], capture_output=True, text=True, timeout=600, check=True
     )
     found = json.loads(done.stdout)
     assert found.keys() == set(names)

@@ -60,9 +60,7 @@ def drop(cells: int = 24, **more: object) -> Scene:
 
 @settings(max_examples=60, deadline=None)
 @given(
-    cells=st.integers(8, 40),
-    kind=st.sampled_from([(4, 1, 3), (6, 2, 3), (5, 1, 4), (7, 2, 4)]),
-    repeats=st.booleans(),
+    cells=st.integers(8, 40), kind=st.sampled_from([(4, 1, 3), (6, 2, 3), (5, 1, 4), (7, 2, 4)]), repeats=st.booleans()
 )
 def test_what_particles_of_a_tile_write_is_reached(cells: int, kind: tuple[int, int, int], repeats: bool) -> None:
     """Nodes of every stencil that drifted as far as it may, and their images behind walls or across the domain."""

@@ -34,9 +34,7 @@ def scene(*, with_features: bool) -> Scene:
     tables = {
         "domain": {"size": [1.0, 1.0], "spacing": 0.1, "gravity": [0.0, -9.81], "walls": "separate"},
         "time": {"end": 1.0, "frames": 1, "step": 1e-4},
-        "bodies": [
-            {"name": "pool", "material": WATER, "shape": {"box": {"min": [0.0, 0.0], "max": [1.0, 0.4]}}},
-        ],
+        "bodies": [{"name": "pool", "material": WATER, "shape": {"box": {"min": [0.0, 0.0], "max": [1.0, 0.4]}}}],
     }
     if not with_features:
         tables["solver"] = {"redistribute": False}

@@ -121,12 +121,7 @@ def test_no_stencil_changes_as_a_body_flies(backend_of: Callable) -> None:
 
     def swing(speed: float) -> np.ndarray:
         scene = body_scene(
-            [0.2, 0.7],
-            [0.6, 1.1],
-            CELLS,
-            end=0.4,
-            velocity=[speed, 0.0],
-            velocity_gradient=[[1.0, 2.0], [0.5, -1.0]],
+            [0.2, 0.7], [0.6, 1.1], CELLS, end=0.4, velocity=[speed, 0.0], velocity_gradient=[[1.0, 2.0], [0.5, -1.0]]
         )
         run = build_run(scene, backend_of("f64", 1))
         for _ in range(100):

@@ -29,11 +29,7 @@ def two_bodies(dimension: int, cells: int, walls: object) -> Scene:
     low, high = [0.3] * d, [0.5] * d
     bodies = [
         {"name": "solid", "material": SOLID, "shape": {"box": {"min": low, "max": high}}},
-        {
-            "name": "liquid",
-            "material": LIQUID,
-            "shape": {"box": {"min": [0.7, *low[1:]], "max": [0.9, *high[1:]]}},
-        },
+        {"name": "liquid", "material": LIQUID, "shape": {"box": {"min": [0.7, *low[1:]], "max": [0.9, *high[1:]]}}},
     ]
     return scene_of(
         domain={"size": [cells * H] * d, "spacing": H, "walls": walls},
@@ -95,22 +91,10 @@ def test_a_slip_corner_is_its_mirror_image(backend_of: Callable, dimension: int,
     steps, dt = 120, 0.004
     size = 16 * H
     corners = [[0.0 if s > 0 else size for s in sign] for sign in signs]
-    boxed = run(
-        backend_of,
-        two_bodies(d, 16, "slip"),
-        [mirrored(body, corners, signs) for body in base],
-        steps,
-        dt,
-    )
+    boxed = run(backend_of, two_bodies(d, 16, "slip"), [mirrored(body, corners, signs) for body in base], steps, dt)
     far = 24 if d == 3 else 32
     centre = [[far * H / 2] * d] * len(signs)
-    free = run(
-        backend_of,
-        two_bodies(d, far, "separate"),
-        [mirrored(body, centre, signs) for body in base],
-        steps,
-        dt,
-    )
+    free = run(backend_of, two_bodies(d, far, "separate"), [mirrored(body, centre, signs) for body in base], steps, dt)
     largest = 0.0
     for name in BODIES[d]:
         n = len(base[0].position)
@@ -150,13 +134,7 @@ def test_a_slip_wall_mirrors_a_separating_floor_too(backend_of: Callable, seed: 
     half = run(backend_of, two_bodies(2, 16, {"default": "separate", "x_min": "slip"}), base, steps, dt)
     centre = [[1.6, 0.0]] * 2
     signs = [(1.0, 1.0), (-1.0, 1.0)]
-    whole = run(
-        backend_of,
-        two_bodies(2, 32, "separate"),
-        [mirrored(body, centre, signs) for body in base],
-        steps,
-        dt,
-    )
+    whole = run(backend_of, two_bodies(2, 32, "separate"), [mirrored(body, centre, signs) for body in base], steps, dt)
     n = len(base[0].position)
     largest = max(float(np.abs(half[name].v - whole[name].v[:n]).max()) for name in BODIES[2])
     record_property("largest difference", largest)
@@ -169,14 +147,7 @@ def block_scene(walls: object, gravity: Sequence[float], **body: object) -> Scen
         domain={"size": [2.0, 1.2], "spacing": H, "walls": walls, "gravity": list(gravity)},
         time={"end": 1.0, "frames": 1},
         solver={"precision": "f64"},
-        bodies=[
-            {
-                "name": "block",
-                "material": SOLID,
-                "shape": {"box": {"min": [0.6, 0.0], "max": [1.0, 0.3]}},
-                **body,
-            }
-        ],
+        bodies=[{"name": "block", "material": SOLID, "shape": {"box": {"min": [0.6, 0.0], "max": [1.0, 0.3]}}, **body}],
     )
 
 

@@ -45,14 +45,7 @@ def sag(ratio: float, **solver: object) -> tuple[float, float, bool]:
     # Half a period of the first mode of a beam, w L^2 = 3.516 sqrt(E' I / (rho A)), and some more for shear.
     end = 1.2 * np.pi * length**2 / (3.516 * thick * np.sqrt(plane / 12 / 1000.0))
     asked = scene(
-        [body],
-        [26, 16],
-        h,
-        end=end,
-        frames=60,
-        gravity=0.1,
-        walls=walls,
-        fields=["velocity", "stress", "volume_ratio"],
+        [body], [26, 16], h, end=end, frames=60, gravity=0.1, walls=walls, fields=["velocity", "stress", "volume_ratio"]
     )
     asked = asked.model_copy(update={"solver": asked.solver.model_copy(update=solver)})
     sample = sample_bodies(asked)[0]

@@ -90,5 +90,5 @@ CASES = [
         "stops within one step, with step, particle and body",
         True,
         named,
-    ),
+    )
 ]

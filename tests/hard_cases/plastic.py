@@ -116,9 +116,7 @@ def steep_sand() -> Outcome:
     shear = np.zeros((3, 3))
     shear[0, 1] = 6 * strain / time
     start_at = replace(
-        cube,
-        velocity=(cube.position - cube.position.mean(0)) @ shear.T,
-        affine=np.tile(shear, (cube.count, 1, 1)),
+        cube, velocity=(cube.position - cube.position.mean(0)) @ shear.T, affine=np.tile(shear, (cube.count, 1, 1))
     )
     run = start(asked, [start_at])
     run.groups[0].replace(deformation=np.tile(np.exp(-strain) * np.eye(3), (cube.count, 1, 1)))

@@ -110,10 +110,7 @@ def fast_spin() -> Outcome:
     w = turn / dt
     spin = np.array([[0.0, -w], [w, 0.0]])
     offset = sample.position - 1.0
-    run = start(
-        asked,
-        [replace(sample, velocity=offset @ spin.T, affine=np.tile(spin, (sample.count, 1, 1)))],
-    )
+    run = start(asked, [replace(sample, velocity=offset @ spin.T, affine=np.tile(spin, (sample.count, 1, 1)))])
     steps = round(turns * 2 * np.pi / turn)
     low, high, fine = 1.0, 1.0, True
     for _ in range(steps // 10):

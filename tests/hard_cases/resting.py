@@ -28,12 +28,7 @@ def column(law: str, precision: str) -> Run:
     modulus = 1.962e6
     materials = {
         "fluid": {"law": "fluid", "density": DENSITY, "bulk_modulus": modulus},
-        "neo_hookean": {
-            "law": "neo_hookean",
-            "density": DENSITY,
-            "youngs_modulus": modulus,
-            "poissons_ratio": 0.0,
-        },
+        "neo_hookean": {"law": "neo_hookean", "density": DENSITY, "youngs_modulus": modulus, "poissons_ratio": 0.0},
     }
     body = block("column", materials[law], [0, 0], [width * h, height])
     walls = {"default": "slip", "y_min": "separate"}
