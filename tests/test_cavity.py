@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 import pytest
-from solver_state import scene_of
+from scenes import block, scene_of, slow
 
 from mpmcli.frames.frame import Frame
 from mpmcli.solver.engine.run import build_run
@@ -43,16 +43,15 @@ def cavity(reynolds: float, n: int, end: float, velocity: Mapping[str, list[floa
     """Return the scene of a box of n cells along each axis, full of liquid."""
     d = len(next(iter(velocity.values())))
     return scene_of(
+        block(
+            "liquid",
+            {"law": "fluid", "density": DENSITY, "viscosity": DENSITY * SPEED / reynolds},
+            [0.0] * d,
+            [1.0] * d,
+        ),
         domain={"size": [1.0] * d, "spacing": 1 / n, "walls": walls, "wall_velocity": velocity},
         time={"end": end, "frames": round(8 * end)},
-        bodies=[
-            {
-                "name": "liquid",
-                "material": {"law": "fluid", "density": DENSITY, "viscosity": DENSITY * SPEED / reynolds},
-                "shape": {"box": {"min": [0.0] * d, "max": [1.0] * d}},
-            }
-        ],
-        output={"fields": ["velocity", "volume_ratio"]},
+        fields=["velocity", "volume_ratio"],
     )
 
 
@@ -70,12 +69,7 @@ def profile(frames: list[Frame], n: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("reynolds", "n", "end", "bound"),
-    [
-        (10.0, 16, 4.0, 0.5),
-        pytest.param(100.0, 32, 15.0, 1.5, marks=pytest.mark.slow),
-        pytest.param(100.0, 64, 15.0, 1.5, marks=pytest.mark.slow),
-    ],
+    ("reynolds", "n", "end", "bound"), [(10.0, 16, 4.0, 0.5), slow(100.0, 32, 15.0, 1.5), slow(100.0, 64, 15.0, 1.5)]
 )
 def test_a_lid_drives_the_flow_below(
     backend_of: Callable, record_property: Callable, reynolds: float, n: int, end: float, bound: float
@@ -115,7 +109,7 @@ def test_nothing_is_crushed_in_a_corner(
     assert least > UNCRUSHED
 
 
-@pytest.mark.parametrize("d", [2, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("d", [2, slow(3)])
 def test_a_lid_drives_nothing_through_other_walls(backend_of: Callable, d: int) -> None:
     """The normal velocity on a wall is zero, up to and in the corners."""
     n = 8

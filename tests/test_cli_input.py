@@ -50,25 +50,19 @@ SCENES = {
         'scene.toml:11: bodies[0].material.densty: unknown key; did you mean "density"?',
     ),
     "wrong type": (("end = 0.05", 'end = "0.05"'), 'scene.toml:7: time.end: must be a number; found "0.05"'),
-    "negative density": (
-        ("density = 1000.0", "density = -1000.0"),
-        "scene.toml:11: bodies[0].material.density: must be greater than 0; found -1000.0",
-    ),
+    "negative density": (("density = 1000.0", "density = -1000.0"),
+        "scene.toml:11: bodies[0].material.density: must be greater than 0; found -1000.0"),
     "zero frames": (("frames = 4", "frames = 0"), "scene.toml:8: time.frames: must be at least 1; found 0"),
-    "body outside": (
-        ("max = [0.75, 0.5]", "max = [0.75, 1.5]"),
+    "body outside": (("max = [0.75, 0.5]", "max = [0.75, 1.5]"),
         'scene.toml:12: bodies[0].shape: body "drop" leaves the domain through y_max by 0.5 m '
-        "(it reaches y = 1.5, the face is at 1); move it or enlarge the domain",
-    ),
-    "1D": (
-        ("size = [1.0, 1.0]", "size = [1.0]"),
-        "scene.toml:3: domain.size: needs two numbers (2D) or three (3D); found 1",
-    ),
+        "(it reaches y = 1.5, the face is at 1); move it or enlarge the domain"),
+    "1D": (("size = [1.0, 1.0]", "size = [1.0]"),
+        "scene.toml:3: domain.size: needs two numbers (2D) or three (3D); found 1"),
     "TOML syntax": (
         ("cells = [16, 16]", "cells = [16, 16"),
         "scene.toml:5:1: not valid TOML: a list is not closed with ]",
     ),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("fault", SCENES)

@@ -276,12 +276,8 @@ def test_a_draw_makes_a_scene_and_leaves_the_sweep_alone():
 
 def test_a_scene_of_rigid_bodies_alone_is_drawn():
     base = """\
-[domain]
-size = [1.0, 1.0]
-cells = [32, 32]
-[time]
-end = 0.1
-frames = 4
+domain = { size = [1.0, 1.0], cells = [32, 32] }
+time = { end = 0.1, frames = 4 }
 [[colliders]]
 name = "ball"
 density = 500.0

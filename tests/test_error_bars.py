@@ -8,7 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scenes
 from command import run_here
+from scenes import block
 
 from mpmcli.error_bars import report
 from mpmcli.error_bars.bars import FLOOR, MARGIN, MATTERS, bars_of
@@ -349,14 +351,8 @@ def test_the_result_is_plotted_with_bands_and_overwritten_with_its_bars(
 
 def test_a_target_gives_the_spacing_of_first_order() -> None:
     """A bar of 4 % at h = 0.05 asks for 0.025 to stay within 2 %, at 2^3 times the seconds."""
-    scene = parse_scene(
-        {
-            "domain": {"size": [1.0, 0.5], "spacing": 0.05},
-            "time": {"end": 1.0, "frames": 40},
-            "bodies": [{"name": "water", "material": "water", "shape": {"box": {"min": [0, 0], "max": [0.4, 0.4]}}}],
-        },
-        laws=parameter_models(),
-    ).scene
+    water = block("water", "water", [0, 0], [0.4, 0.4])
+    scene = scenes.scene_of(water, size=[1.0, 0.5], spacing=0.05, frames=40, contact={})
     base = series_of(water__high__x=0.5)
     base.seconds = 10.0
     study = Study(scene, base, [(grid(2.0), series_of(water__high__x=0.5 + 0.04 / MARGIN))])

@@ -15,6 +15,7 @@ from command import SCENE, run_here
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_result import made_frame, made_header, made_row
+from scenes import block, box, liquid, solid
 from test_checksums import flip, place_of
 from test_output_frames import make_frame
 from test_output_segments import fill
@@ -39,30 +40,18 @@ CHANGING = {
     "time": {"end": 0.4, "frames": 7},
     "output": {"fields": ["velocity", "density"]},
     "bodies": [
-        {
-            "name": "sand",
-            "shape": {"box": {"min": [0.1, 0.0], "max": [0.6, 0.2]}},
-            "material": {
-                "law": "sand",
-                "density": 1600.0,
-                "youngs_modulus": 2e5,
-                "poissons_ratio": 0.3,
-                "friction_angle": 30.0,
-            },
-        }
+        block(
+            "sand",
+            {"law": "sand", "density": 1600.0, "youngs_modulus": 2e5, "poissons_ratio": 0.3, "friction_angle": 30.0},
+            [0.1, 0.0],
+            [0.6, 0.2],
+        )
     ],
-    "emitters": [
-        {
-            "name": "jet",
-            "shape": {"box": {"min": [0.75, 0.7], "max": [0.9, 0.75]}},
-            "velocity": [0.0, -1.5],
-            "material": {"law": "fluid", "density": 1000.0, "bulk_modulus": 2e4, "volume_correction": True},
-        }
-    ],
+    "emitters": [block("jet", liquid(2e4, volume_correction=True), [0.75, 0.7], [0.9, 0.75], velocity=[0.0, -1.5])],
     "colliders": [
         {
             "name": "paddle",
-            "shape": {"box": {"min": [0.3, 0.25], "max": [0.5, 0.35]}},
+            "shape": box([0.3, 0.25], [0.5, 0.35]),
             "wall": "slip",
             "friction": 0.3,
             "velocity": [0.3, "-0.5 + t"],
@@ -76,12 +65,13 @@ TOTAL = {
     "time": {"end": 0.1, "frames": 4},
     "solver": {"solids": "total"},
     "bodies": [
-        {
-            "name": f"block {k}",
-            "shape": {"box": {"min": [0.1 + 0.5 * k, 0.3], "max": [0.4 + 0.5 * k, 0.6]}},
-            "velocity": [2.0 - 4.0 * k, 0.0],
-            "material": {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 2e5, "poissons_ratio": 0.3},
-        }
+        block(
+            f"block {k}",
+            solid(2e5, poissons_ratio=0.3),
+            [0.1 + 0.5 * k, 0.3],
+            [0.4 + 0.5 * k, 0.6],
+            velocity=[2.0 - 4.0 * k, 0.0],
+        )
         for k in range(2)
     ],
 }

@@ -10,13 +10,8 @@ from mpmcli.scene import Scene, load_scene, scene_to_toml
 
 BASE = """\
 title = "two"
-[domain]
-size = [4.0, 2.0]
-spacing = 0.01
-gravity = [0.0, -9.81]
-[time]
-end = 1.5
-frames = 150
+domain = { size = [4.0, 2.0], spacing = 0.01, gravity = [0.0, -9.81] }
+time = { end = 1.5, frames = 150 }
 [[bodies]]
 name = "column"
 material = "water"

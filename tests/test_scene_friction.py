@@ -1,19 +1,15 @@
 """What a scene may say about friction of walls, and the sentences for what it may not."""
 
 import pytest
-from solver_state import scene_of
+from scenes import block, scene_of
 
 from mpmcli.errors import InputError
 from mpmcli.scene import Scene
 
 
 def scene(walls: object, friction: object, dimension: int = 2) -> Scene:
-    box = {"min": [0.2] * dimension, "max": [0.5] * dimension}
-    return scene_of(
-        domain={"size": [1.0] * dimension, "spacing": 0.1, "walls": walls, "friction": friction},
-        time={"end": 1.0, "frames": 1},
-        bodies=[{"name": "a", "material": "jelly", "shape": {"box": box}}],
-    )
+    one = block("a", "jelly", [0.2] * dimension, [0.5] * dimension)
+    return scene_of(one, size=[1.0] * dimension, spacing=0.1, walls=walls, friction=friction)
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """`--set KEY=VALUE`: which value it replaces, and what is said where it cannot."""
 
 import pytest
+from scenes import block
 
 from mpmcli.errors import InputError
 from mpmcli.materials.registry import parameter_models
@@ -11,13 +12,7 @@ DATA = {
     "title": "t",
     "time": {"end": 1.0, "frames": 2},
     "domain": {"size": [1, 1], "spacing": 0.1},
-    "bodies": [
-        {
-            "name": "column",
-            "material": {"law": "fluid", "density": 1000},
-            "shape": {"box": {"min": [0, 0], "max": [0.5, 0.5]}},
-        }
-    ],
+    "bodies": [block("column", {"law": "fluid", "density": 1000}, [0, 0], [0.5, 0.5])],
 }
 
 

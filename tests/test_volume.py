@@ -5,14 +5,13 @@ from itertools import product
 
 import numpy as np
 import pytest
-from scenes import block, scene, volume_errors
+from scenes import block, scene, slow, volume_errors
 from scipy.stats import norm
 
 from mpmcli.materials.fluid import BESIDE, DEAD_BAND, FREE_DEAD_BAND, FULL, LARGEST_LACK, OPENED, RELAXATION, Fluid
-from mpmcli.materials.registry import parameter_models
 from mpmcli.materials.sand import BAND, Sand
 from mpmcli.materials.sand import RELAXATION as GRAINS_RELAXATION
-from mpmcli.scene import Scene, parse_scene, sample_bodies
+from mpmcli.scene import Scene, sample_bodies
 from mpmcli.solver.engine import kernel_store
 from mpmcli.solver.engine.plan import make_plan
 from mpmcli.solver.engine.run import build_run
@@ -150,9 +149,9 @@ def test_openings_are_remembered(backend_of: Callable) -> None:
 @pytest.mark.parametrize(
     ("densities", "walls", "d"),
     [
-        pytest.param((1000.0,), "slip", 2, marks=pytest.mark.slow, id="one density"),
+        slow((1000.0,), "slip", 2, id="one density"),
         pytest.param((1000.0, 400.0), {"default": "stick", "x_max": "slip"}, 2, id="two densities"),
-        pytest.param((1000.0,), "slip", 3, marks=pytest.mark.slow, id="3D"),
+        slow((1000.0,), "slip", 3, id="3D"),
     ],
 )
 def test_volume_follows_the_grid(
@@ -302,17 +301,12 @@ def test_nodes_keep_volume_only_where_densities_differ(backend_of: Callable) -> 
 
 def uncorrected(tables: dict) -> Scene:
     bodies = [{**body, "material": {**body["material"], "volume_correction": False}} for body in tables["bodies"]]
-    return parse_scene({**tables, "bodies": bodies}, laws=parameter_models()).scene
+    return scene_of(**tables | {"contact": {}, "bodies": bodies})
 
 
 @pytest.mark.parametrize(
     ("name", "least"),
-    [
-        pytest.param("toss", 0.3, marks=pytest.mark.slow),
-        pytest.param("sand_toss", 0.3, marks=pytest.mark.slow),
-        pytest.param("dam_at_rest", 0.05, marks=pytest.mark.slow),
-        pytest.param("stirred_pool", 0.05, marks=pytest.mark.slow),
-    ],
+    [slow("toss", 0.3), slow("sand_toss", 0.3), slow("dam_at_rest", 0.05), slow("stirred_pool", 0.05)],
 )
 def test_a_case_of_volume_fails_without_the_correction(
     backend_of: Callable, record_property: Callable, name: str, least: float

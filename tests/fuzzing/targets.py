@@ -75,13 +75,8 @@ def _scene_text(rng: Random) -> Input:
 def _override(rng: Random) -> Input:
     files = seeds.chosen(seeds.scenes(), rng)
     keys = (
-        "time.end",
-        "bodies[0].velocity",
-        "bodies.0.material.density",
-        "domain.gravity",
-        "solver.precision",
-        "title",
-    )
+        "time.end", "bodies[0].velocity", "bodies.0.material.density", "domain.gravity", "solver.precision", "title",
+    )  # fmt: skip
     said = f"{rng.choice(keys)}={value_mutant(rng)}".encode("utf-8", "replace")
     word = text_mutant(said, rng) if rng.random() < 0.5 else said
     word = word.replace(b"\0", b"0").decode("utf-8", "replace")

@@ -3,9 +3,10 @@
 from dataclasses import replace
 
 import numpy as np
+from scenes import block
 
 from hard_cases.case import HardCase, Outcome
-from hard_cases.running import GRAVITY, block, look, run, scene, sound, start
+from hard_cases.running import GRAVITY, look, run, scene, sound, start
 from mpmcli.scene import sample_bodies
 
 H, SIDE = 0.1, 0.8
@@ -138,36 +139,14 @@ def steep_sand() -> Outcome:
 
 
 CASES = [
-    HardCase(
-        "H15",
-        "hardening snow",
+    HardCase("H15", "hardening snow",
         "a cube of snow whose sides move in at 80 m/s, until it fills less than half of its area",
-        "the wave limit falls as 1 / sqrt(hardening), which stays below its limit of 100; no NaN",
-        True,
-        packed_snow,
-    ),
-    HardCase(
-        "H16",
-        "volume gain of sand",
+        "the wave limit falls as 1 / sqrt(hardening), which stays below its limit of 100; no NaN", True, packed_snow),
+    HardCase("H16", "volume gain of sand",
         "sand thrown up by 2 cos^2(2 pi x / W) y / H m/s and landed, with and without volume correction",
-        "the deposit gains < 5 % with correction, > 10 % without",
-        True,
-        volume_gain,
-    ),
-    HardCase(
-        "H17",
-        "tip of the cone",
-        "a cube of sand that falls freely and expands",
-        "no NaN, no stress, free fall of the centre of mass to 1e-5",
-        True,
-        free_fall,
-    ),
-    HardCase(
-        "H20",
-        "steep friction angle in 3D",
-        "sand of 45 degrees in 3D, compressed and sheared in plane strain",
-        "yields at 45 degrees in the plane, where Klar's alpha would never",
-        True,
-        steep_sand,
-    ),
-]
+        "the deposit gains < 5 % with correction, > 10 % without", True, volume_gain),
+    HardCase("H17", "tip of the cone", "a cube of sand that falls freely and expands",
+        "no NaN, no stress, free fall of the centre of mass to 1e-5", True, free_fall),
+    HardCase("H20", "steep friction angle in 3D", "sand of 45 degrees in 3D, compressed and sheared in plane strain",
+        "yields at 45 degrees in the plane, where Klar's alpha would never", True, steep_sand),
+]  # fmt: skip

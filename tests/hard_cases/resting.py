@@ -3,9 +3,10 @@
 from dataclasses import replace
 
 import numpy as np
+from scenes import block
 
 from hard_cases.case import HardCase, Outcome
-from hard_cases.running import GRAVITY, block, look, scene, sound, start
+from hard_cases.running import GRAVITY, look, scene, sound, start
 from mpmcli.scene import sample_bodies
 from mpmcli.solver.engine.run import Run
 
@@ -146,20 +147,11 @@ def long_runs(steps: int, periods: int) -> Outcome:
 
 
 CASES = [
-    HardCase(
-        "H11",
-        "long runs",
+    HardCase("H11", "long runs",
         "a rubber block set on the floor, 2e5 steps; the first slosh mode of a tank on 16 x 8 cells, 100 periods",
-        "centre of mass and particles drift by < 0.1 h; at the end KE < 1e-8 m g H",
-        True,
-        lambda: long_runs(200_000, 100),
-    ),
-    HardCase(
-        "H14",
-        "jitter at rest",
+        "centre of mass and particles drift by < 0.1 h; at the end KE < 1e-8 m g H", True,
+        lambda: long_runs(200_000, 100)),
+    HardCase("H14", "jitter at rest",
         "columns of water and of rubber, 1 m high, that start in the state of rest; h = 1/32, f32",
-        "max|v| < 1e-3 sqrt(g H) from 1 s to 2 s",
-        True,
-        lambda: jitter("f32"),
-    ),
-]
+        "max|v| < 1e-3 sqrt(g H) from 1 s to 2 s", True, lambda: jitter("f32")),
+]  # fmt: skip
