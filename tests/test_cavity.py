@@ -42,13 +42,9 @@ def reference(reynolds: float, n: int = 64) -> np.ndarray:
 def cavity(reynolds: float, n: int, end: float, velocity: Mapping[str, list[float]], walls: object = "stick"):
     """Return the scene of a box of n cells along each axis, full of liquid."""
     d = len(next(iter(velocity.values())))
+    material = {"law": "fluid", "density": DENSITY, "viscosity": DENSITY * SPEED / reynolds}
     return scene_of(
-        block(
-            "liquid",
-            {"law": "fluid", "density": DENSITY, "viscosity": DENSITY * SPEED / reynolds},
-            [0.0] * d,
-            [1.0] * d,
-        ),
+        block("liquid", material, [0.0] * d, [1.0] * d),
         domain={"size": [1.0] * d, "spacing": 1 / n, "walls": walls, "wall_velocity": velocity},
         time={"end": end, "frames": round(8 * end)},
         fields=["velocity", "volume_ratio"],
@@ -86,18 +82,15 @@ def test_a_lid_drives_the_flow_below(
     assert least > UNCRUSHED
 
 
-@pytest.mark.parametrize(
-    ("velocity", "walls"),
-    [
-        pytest.param({"y_max": [SPEED, 0.0], "y_min": [-SPEED, 0.0]}, "stick", id="opposite"),
-        pytest.param({"y_max": [SPEED, 0.0], "x_max": [0.0, SPEED]}, "stick", id="meet"),
-        pytest.param({"x_min": [0.0, SPEED]}, {"default": "slip", "x_min": "stick"}, id="slip"),
-        pytest.param({"y_max": [SPEED, 0.0, 0.7 * SPEED]}, "stick", id="3D"),
-        pytest.param(
-            {"y_max": [SPEED, 0.0, 0.0]}, {"default": "stick", "z_min": "periodic", "z_max": "periodic"}, id="periodic"
-        ),
-    ],
-)
+@pytest.mark.parametrize(("velocity", "walls"), [
+    pytest.param({"y_max": [SPEED, 0.0], "y_min": [-SPEED, 0.0]}, "stick", id="opposite"),
+    pytest.param({"y_max": [SPEED, 0.0], "x_max": [0.0, SPEED]}, "stick", id="meet"),
+    pytest.param({"x_min": [0.0, SPEED]}, {"default": "slip", "x_min": "stick"}, id="slip"),
+    pytest.param({"y_max": [SPEED, 0.0, 0.7 * SPEED]}, "stick", id="3D"),
+    pytest.param(
+        {"y_max": [SPEED, 0.0, 0.0]}, {"default": "stick", "z_min": "periodic", "z_max": "periodic"}, id="periodic"
+    ),
+])  # fmt: skip
 @pytest.mark.slow
 def test_nothing_is_crushed_in_a_corner(
     backend_of: Callable, record_property: Callable, velocity: Mapping[str, list[float]], walls: object

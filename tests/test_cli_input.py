@@ -118,23 +118,20 @@ def test_a_backend_that_is_not_there_is_refused(refused, monkeypatch):
     assert said == "--arch cuda needs a device that this machine does not have; use --arch cpu."
 
 
-@pytest.mark.parametrize(
-    ("arguments", "sentence"),
-    [
-        (["simulat"], 'there is no command "simulat"; did you mean "simulate"? See mpmcli --help.'),
-        (["paint"], 'there is no command "paint"; the commands are new, check, simulate, materials, info, '),
-        (["--verbose"], "no such option '--verbose'"),
-        (["simulate"], "missing argument 'SCENE'. See mpmcli simulate --help."),
-        (["simulate", "a.toml", "b.toml"], "got unexpected extra argument (b.toml). See mpmcli simulate --help."),
-        (["simulate", "nothing.toml"], "nothing.toml: there is no such file"),
-        (["simulate", "."], ".: this is a directory; did you mean scene.toml?"),
-        (["info", "nothing.toml"], "nothing.toml: there is no such file"),
-        (["info", "nothing"], "nothing does not exist"),
-        (["info", "."], ". holds no result of mpmcli"),
-        (["completion", "tcsh"], "invalid value"),
-        (["bench", "--case", "4d-1"], 'there is no case "4d-1"; the cases are 2d-64, '),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "sentence"), [
+    (["simulat"], 'there is no command "simulat"; did you mean "simulate"? See mpmcli --help.'),
+    (["paint"], 'there is no command "paint"; the commands are new, check, simulate, materials, info, '),
+    (["--verbose"], "no such option '--verbose'"),
+    (["simulate"], "missing argument 'SCENE'. See mpmcli simulate --help."),
+    (["simulate", "a.toml", "b.toml"], "got unexpected extra argument (b.toml). See mpmcli simulate --help."),
+    (["simulate", "nothing.toml"], "nothing.toml: there is no such file"),
+    (["simulate", "."], ".: this is a directory; did you mean scene.toml?"),
+    (["info", "nothing.toml"], "nothing.toml: there is no such file"),
+    (["info", "nothing"], "nothing does not exist"),
+    (["info", "."], ". holds no result of mpmcli"),
+    (["completion", "tcsh"], "invalid value"),
+    (["bench", "--case", "4d-1"], 'there is no case "4d-1"; the cases are 2d-64, '),
+])  # fmt: skip
 def test_a_bad_command_is_refused_with_one_sentence(refused, arguments, sentence):
     assert refused(*arguments).startswith(sentence)
 

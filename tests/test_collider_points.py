@@ -40,19 +40,16 @@ def falling(
     ), z
 
 
-@pytest.mark.parametrize(
-    ("material", "offset", "options"),
-    [
-        (WATER, 0.0, {}),
-        (WATER, 0.3, {}),
-        (WATER, 0.5, {}),
-        (SAND, 0.0, {}),
-        (SAND, 0.4, {}),
-        pytest.param(WATER, 0.25, {"dimension": 3}, marks=pytest.mark.slow),
-        pytest.param(SAND, 0.25, {"dimension": 3}, marks=pytest.mark.slow),
-        pytest.param(WATER, 0.25, {"kernel": "cubic"}, marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.parametrize(("material", "offset", "options"), [
+    (WATER, 0.0, {}),
+    (WATER, 0.3, {}),
+    (WATER, 0.5, {}),
+    (SAND, 0.0, {}),
+    (SAND, 0.4, {}),
+    pytest.param(WATER, 0.25, {"dimension": 3}, marks=pytest.mark.slow),
+    pytest.param(SAND, 0.25, {"dimension": 3}, marks=pytest.mark.slow),
+    pytest.param(WATER, 0.25, {"kernel": "cubic"}, marks=pytest.mark.slow),
+])  # fmt: skip
 def test_what_falls_lies_where_the_surface_is(
     backend_of: Callable, material: dict, offset: float, options: dict
 ) -> None:
@@ -77,14 +74,10 @@ def test_what_falls_lies_where_the_surface_is(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("material", "offset", "most"),
-    # 0.25, 0.30, 0.48 midway between nodes, 0.24; sand 0.25, 0.30.
-    [
-        (WATER, 0.0, 0.32), (WATER, 0.25, 0.32), (WATER, 0.5, 0.52), (WATER, 0.75, 0.32), (SAND, 0.0, 0.32),
-        (SAND, 0.25, 0.32),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("material", "offset", "most"), [
+    (WATER, 0.0, 0.32), (WATER, 0.25, 0.32), (WATER, 0.5, 0.52), (WATER, 0.75, 0.32), (SAND, 0.0, 0.32),
+    (SAND, 0.25, 0.32),
+])  # fmt: skip
 def test_what_falls_meets_the_surface(
     backend_of: Callable, material: dict, offset: float, most: float, record_property: Callable
 ) -> None:
@@ -192,21 +185,18 @@ def vessel(
     )
 
 
-@pytest.mark.parametrize(
-    ("thickness", "offset", "share"),
-    [
-        (2, 0.0, 0.0),
-        # One particle of 480 was at 0.31 cells.
-        (2, 0.3, 0.0025),
-        pytest.param(1, 0.0, 0.005, marks=pytest.mark.slow),
-        # A wall of one cell between nodes leaks: 0.146 here, and 0.45 at 0.5.
-        pytest.param(1, 0.3, 0.2, marks=pytest.mark.slow),
-        # Two particles of 480 were at 0.33 cells.
-        pytest.param(2.5, 0.0, 0.005, marks=pytest.mark.slow),
-        pytest.param(3, 0.0, 0.0, marks=pytest.mark.slow),
-        pytest.param(4, 0.0, 0.0, marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.parametrize(("thickness", "offset", "share"), [
+    (2, 0.0, 0.0),
+    # One particle of 480 was at 0.31 cells.
+    (2, 0.3, 0.0025),
+    pytest.param(1, 0.0, 0.005, marks=pytest.mark.slow),
+    # A wall of one cell between nodes leaks: 0.146 here, and 0.45 at 0.5.
+    pytest.param(1, 0.3, 0.2, marks=pytest.mark.slow),
+    # Two particles of 480 were at 0.33 cells.
+    pytest.param(2.5, 0.0, 0.005, marks=pytest.mark.slow),
+    pytest.param(3, 0.0, 0.0, marks=pytest.mark.slow),
+    pytest.param(4, 0.0, 0.0, marks=pytest.mark.slow),
+])  # fmt: skip
 def test_a_vessel_with_thin_walls_holds_water(
     backend_of: Callable, thickness: float, offset: float, share: float, record_property: Callable
 ) -> None:
@@ -265,15 +255,9 @@ def test_couette_flow_ends_at_a_surface_that_sticks(
     """The profile between it and a wall that moves is 0 at the surface, to 0.12 cells (0.27 off at nodes)."""
     z, speed, top = (8 + offset) * H, 1.0, 24 * H
     rate = speed / (top - z)
+    motion = {"velocity": [speed / 2, 0.0], "velocity_gradient": [[0.0, rate], [0.0, 0.0]]}
     asked = scene_of(
-        block(
-            "body",
-            WATER | {"viscosity": 100.0},
-            [0.0, z],
-            [8 * H, top],
-            velocity=[speed / 2, 0.0],
-            velocity_gradient=[[0.0, rate], [0.0, 0.0]],
-        ),
+        block("body", WATER | {"viscosity": 100.0}, [0.0, z], [8 * H, top], **motion),
         domain={"size": [8 * H, top], "spacing": H},
         walls={"default": "periodic", "y_min": "stick", "y_max": "stick"},
         wall_velocity={"y_max": [speed, 0.0]},

@@ -264,15 +264,10 @@ def block_on_plane(
         [f"{int(i == j)} - {normal[i] * normal[j] * 1000 * G / 1e6} * ({height} - s)" for j in (0, 1)] for i in (0, 1)
     ]
     place = f"({normal[0]}*(X - {corner[0]}) + {normal[1]}*(Y - {corner[1]}))"
-    weight = {"deformation": [[entry.replace("s)", f"{place})") for entry in row] for row in strain]}
+    weight = {"deformation": [[entry.replace("s)", f"{place})") for entry in row] for row in strain]} if speed else {}
+    material = JELLY | ({"poissons_ratio": 0.0} if speed else {})
     scene = scene_of(
-        body(
-            "block",
-            JELLY | ({"poissons_ratio": 0.0} if speed else {}),
-            polygon([list(c) for c in corners]),
-            velocity=list(speed * down),
-        )
-        | (weight if speed else {}),
+        body("block", material, polygon([list(c) for c in corners]), velocity=list(speed * down), **weight),
         domain={"size": [64 * h, 48 * h], "spacing": h, "gravity": [f"{x}{slowly}" for x in pull]},
         time={"end": end, "frames": 40},
         precision="f64",

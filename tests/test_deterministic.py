@@ -41,27 +41,16 @@ def mixed(
     dimension: int, materials: Sequence[dict] = (WATER, JELLY, SAND), *, deterministic: bool = True, **solver: object
 ) -> Scene:
     """Return bodies that meet: water, a jelly that averages its volumes, and sand, or others."""
-    low = (0.0, 0.0, 0.0), (0.45, 0.1, 0.2), (0.1, 0.4, 0.1)
+    d, low = dimension, ((0.0, 0.0, 0.0), (0.45, 0.1, 0.2), (0.1, 0.4, 0.1))
     high = (0.4, 0.3, 0.9), (0.65, 0.4, 0.7), (0.5, 0.7, 0.5)
     bodies = [
-        block(
-            f"body {k}",
-            material,
-            list(first[:dimension]),
-            list(last[:dimension]),
-            velocity=[speed, -0.5, 0.0][:dimension],
-            sampling="jittered",
-        )
+        block(f"body {k}", material, first[:d], last[:d], velocity=[speed, -0.5, 0.0][:d], sampling="jittered")
         for k, (material, first, last, speed) in enumerate(zip(materials, low, high, (1.0, -1.0, -1.0), strict=False))
     ]
     return scene_of(
         *bodies,
-        size=[1.0] * dimension,
-        spacing=0.1,
-        gravity=[0.0, -9.81, 0.0][:dimension],
-        walls="separate",
-        end=0.12,
-        frames=3,
+        domain={"size": [1.0] * d, "spacing": 0.1, "gravity": [0.0, -9.81, 0.0][:d], "walls": "separate"},
+        time={"end": 0.12, "frames": 3},
         solver={"deterministic": deterministic, **solver},
     )
 

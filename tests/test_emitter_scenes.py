@@ -43,23 +43,17 @@ def jet_scene(d: int = 2, **more: object) -> Scene:
     )
 
 
-@pytest.mark.parametrize(
-    ("shape", "velocity", "area"),
-    [
-        (box([0.1, 0.2], [0.3, 0.5]), [2.0, 0.0], 0.3),
-        (box([0.1, 0.2], [0.3, 0.5]), [0.0, -1.0], 0.2),
-        # Through the centre at 45 degrees, from one long side to the other.
-        (box([0.1, 0.2], [0.3, 0.5]), [1.0, 1.0], 0.2 * math.sqrt(2)),
-        (ball([0.4, 0.4], 0.13), [1.0, 3.0], 0.26),
-        (box([0.1, 0.2, 0.3], [0.3, 0.5, 0.7]), [0.0, 0.0, 3.0], 0.06),
-        (ball([0.4, 0.4, 0.4], 0.2), [1.0, 1.0, 1.0], math.pi * 0.04),
-        (
-            {"cylinder": {"base": [0.4, 0.2, 0.4], "axis": [0, 1, 0], "radius": 0.2, "height": 0.1}},
-            [0.0, -1.0, 0.0],
-            math.pi * 0.04,
-        ),
-    ],
-)
+@pytest.mark.parametrize(("shape", "velocity", "area"), [
+    (box([0.1, 0.2], [0.3, 0.5]), [2.0, 0.0], 0.3),
+    (box([0.1, 0.2], [0.3, 0.5]), [0.0, -1.0], 0.2),
+    # Through the centre at 45 degrees, from one long side to the other.
+    (box([0.1, 0.2], [0.3, 0.5]), [1.0, 1.0], 0.2 * math.sqrt(2)),
+    (ball([0.4, 0.4], 0.13), [1.0, 3.0], 0.26),
+    (box([0.1, 0.2, 0.3], [0.3, 0.5, 0.7]), [0.0, 0.0, 3.0], 0.06),
+    (ball([0.4, 0.4, 0.4], 0.2), [1.0, 1.0, 1.0], math.pi * 0.04),
+    ({"cylinder": {"base": [0.4, 0.2, 0.4], "axis": [0, 1, 0], "radius": 0.2, "height": 0.1}}, [0.0, -1.0, 0.0],
+     math.pi * 0.04),
+])  # fmt: skip
 def test_the_mouth_is_the_section_and_the_flow_its_area_times_the_speed(shape, velocity, area):
     """The area to 2e-3, of which the flow is a multiple, whatever the sampling; all enter two cells before it."""
     for sampling in ("lattice", "turned", "jittered"):

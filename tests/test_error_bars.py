@@ -134,16 +134,13 @@ def test_runs_part_where_rounding_moves_half_a_percent_of_the_mass() -> None:
     assert bars_of(series_of(), []).parted is None
 
 
-@pytest.mark.parametrize(
-    ("value", "bar", "said"),
-    [
-        (0.8314, 0.0234, "0.831 ± 0.023"),
-        (0.8314, 0.051, "0.83 ± 0.05"),
-        (12401, 54.2, "12401 ± 54"),
-        (0.2, 3, "0 ± 3"),
-        (0.459, 0.0099, "0.459 ± 0.010"),
-    ],
-)
+@pytest.mark.parametrize(("value", "bar", "said"), [
+    (0.8314, 0.0234, "0.831 ± 0.023"),
+    (0.8314, 0.051, "0.83 ± 0.05"),
+    (12401, 54.2, "12401 ± 54"),
+    (0.2, 3, "0 ± 3"),
+    (0.459, 0.0099, "0.459 ± 0.010"),
+])  # fmt: skip
 def test_a_value_has_the_digits_of_its_bar(value: float, bar: float, said: str) -> None:
     found = bars_of(series_of(a__low__x=value), [(grid(2.0), series_of(a__low__x=value + bar / MARGIN))])
     assert found.of["a.low.x"].text(-1) == said
@@ -387,17 +384,14 @@ def test_a_scene_without_siblings_is_told_so(tmp_path: Path) -> None:
     assert (tmp_path / "r" / "particles.vtkhdf").exists()
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (("--level", "step", "--budget", "1h"), "without --level, --only and --skip"),
-        (("--only", "grids"), 'there is no cause "grids"'),
-        (("--skip", "grid"), "leave nothing to compute, as model needs grid"),
-        (("--only", "step", "--skip", "step"), "leave nothing to compute:"),
-        (("--budget", "0.001s"), "allows nothing"),
-        (("--levels", "fine"), "--levels"),
-    ],
-)
+@pytest.mark.parametrize(("words", "said"), [
+    (("--level", "step", "--budget", "1h"), "without --level, --only and --skip"),
+    (("--only", "grids"), 'there is no cause "grids"'),
+    (("--skip", "grid"), "leave nothing to compute, as model needs grid"),
+    (("--only", "step", "--skip", "step"), "leave nothing to compute:"),
+    (("--budget", "0.001s"), "allows nothing"),
+    (("--levels", "fine"), "--levels"),
+])  # fmt: skip
 def test_options_that_cannot_be_used_have_a_sentence(tmp_path: Path, words: tuple[str, ...], said: str) -> None:
     (tmp_path / "drop.toml").write_text(SCENE)
     outcome = run_here("validate", tmp_path / "drop.toml", *words)

@@ -228,13 +228,10 @@ def test_time_codes_of_usd_are_frames(tmp_path, stride):
         del points, stage
 
 
-@pytest.mark.parametrize(
-    ("gravity", "up"),
-    [
-        ([0.0, 0.0, -9.81], "Z"), ([0.0, -9.81, 0.0], "Y"), ([0.0, "-g * min(t / 0.05, 1)", 0.0], "Y"),
-        ([0.0, "5 * sin(20 * t)", "-g"], "Z"), ([0.0, "-5 * sin(t)", 0.0], "Y"), ([0.0, 0.0, 0.0], "Z"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("gravity", "up"), [
+    ([0.0, 0.0, -9.81], "Z"), ([0.0, -9.81, 0.0], "Y"), ([0.0, "-g * min(t / 0.05, 1)", 0.0], "Y"),
+    ([0.0, "5 * sin(20 * t)", "-g"], "Z"), ([0.0, "-5 * sin(t)", 0.0], "Y"), ([0.0, 0.0, 0.0], "Z"),
+])  # fmt: skip
 def test_up_in_usd_is_against_gravity(tmp_path, gravity, up):
     """Also where it is an expression."""
     usd, geom = (pytest.importorskip(f"pxr.{name}") for name in ("Usd", "UsdGeom"))

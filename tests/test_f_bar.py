@@ -191,16 +191,13 @@ def test_a_uniform_change_of_volume_is_not_changed(backend_of: Callable) -> None
     assert np.abs(averaged - plain).max() < 1e-12 * np.abs(plain).max()
 
 
-@pytest.mark.parametrize(
-    ("material", "setting", "averages"),
-    [
-        ({"law": "neo_hookean", "poissons_ratio": 0.45}, "auto", False),
-        ({"law": "neo_hookean", "poissons_ratio": 0.46}, "auto", True),
-        ({"law": "neo_hookean", "poissons_ratio": 0.2}, True, True),
-        ({"law": "neo_hookean", "poissons_ratio": 0.49}, False, False),
-        ({"law": "sand", "friction_angle": 30.0, "poissons_ratio": 0.46}, "auto", False),
-    ],
-)
+@pytest.mark.parametrize(("material", "setting", "averages"), [
+    ({"law": "neo_hookean", "poissons_ratio": 0.45}, "auto", False),
+    ({"law": "neo_hookean", "poissons_ratio": 0.46}, "auto", True),
+    ({"law": "neo_hookean", "poissons_ratio": 0.2}, True, True),
+    ({"law": "neo_hookean", "poissons_ratio": 0.49}, False, False),
+    ({"law": "sand", "friction_angle": 30.0, "poissons_ratio": 0.46}, "auto", False),
+])  # fmt: skip
 def test_who_averages(backend_of: Callable, material: dict, setting: object, averages: bool) -> None:
     run = build_run(block(material=material, law=material["law"], solver={"f_bar": setting}), backend_of("f64", 1))
     assert run.groups[0].arrays.uses_f_bar == averages

@@ -85,14 +85,9 @@ def test_bodies_of_unequal_shares_keep_both_momenta(backend_of: Callable, solids
 
 def test_deformation_bounds_a_bodys_own_step(backend_of: Callable) -> None:
     """A cell that is stretched at r = 2/s, nearly without stiffness: 0.5 / r; its speed allows twice that."""
+    soft = SOFT | {"youngs_modulus": 1e-6}
     scene = scene_of(
-        block(
-            "cell",
-            SOFT | {"youngs_modulus": 1e-6},
-            [0.5, 0.5],
-            [0.55, 0.55],
-            velocity=["2 * (X - 0.525)", "-2 * (Y - 0.525)"],
-        ),
+        block("cell", soft, [0.5, 0.5], [0.55, 0.55], velocity=["2 * (X - 0.525)", "-2 * (Y - 0.525)"]),
         domain={"size": [1.0, 1.0], "spacing": 0.05},
         step=0.02,
         precision="f64",
@@ -176,19 +171,16 @@ def test_what_is_known_is_as_far_off_at_any_step(
         assert max(abs(found[measure]) for measure in measures or found) < bound, part
 
 
-@pytest.mark.parametrize(
-    ("name", "n", "measure", "tolerance"),
-    [
-        slow("two_disks", 20, "energy loss", 0.05),
-        slow("conservation_contact", 16, "energy loss", 0.02),
-        slow("conservation", 8, "energy loss", 0.02),
-        slow("taylor_green", 16, "decay error", 0.05),
-        slow("dam_break", 16, "front error", 0.05),
-        slow("bar_fixed_fixed", 13, "energy loss", 0.05),
-        slow("bar_fixed_free", 13, "energy loss", 0.2),
-        slow("spinning_disc", 8, "energy loss", 0.1),
-    ],
-)
+@pytest.mark.parametrize(("name", "n", "measure", "tolerance"), [
+    slow("two_disks", 20, "energy loss", 0.05),
+    slow("conservation_contact", 16, "energy loss", 0.02),
+    slow("conservation", 8, "energy loss", 0.02),
+    slow("taylor_green", 16, "decay error", 0.05),
+    slow("dam_break", 16, "front error", 0.05),
+    slow("bar_fixed_fixed", 13, "energy loss", 0.05),
+    slow("bar_fixed_free", 13, "energy loss", 0.2),
+    slow("spinning_disc", 8, "energy loss", 0.1),
+])  # fmt: skip
 def test_the_table_of_what_steps_lose(backend_of: Callable, name: str, n: int, measure: str, tolerance: float) -> None:
     """Of docs/theory.md, 2.3: what validation cases lose in steps of 1, 1/5 and 1/50; differences fall with h."""
     case, lost = all_cases()[name], []

@@ -31,14 +31,9 @@ def ball(name: str, dimension: int = 2, walls: object = "periodic", **more: dict
     """Return a ball that spins and flies in the middle of a box whose faces are all periodic."""
     material, tables = BALLS[name]
     d, spin = dimension, [[0.0, -3.0, 0.0], [3.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
+    motion = {"velocity": [0.9, 0.4, -0.3][:d], "velocity_gradient": [row[:d] for row in spin[:d]]}
     return scene_of(
-        body(
-            "ball",
-            material,
-            {"ball": {"center": [8 * H] * d, "radius": 3.3 * H}},
-            velocity=[0.9, 0.4, -0.3][:d],
-            velocity_gradient=[row[:d] for row in spin[:d]],
-        ),
+        body("ball", material, {"ball": {"center": [8 * H] * d, "radius": 3.3 * H}}, **motion),
         domain={"size": [16 * H] * d, "spacing": H, "walls": walls} | more.get("domain", {}),
         frames=4,
         solver={"precision": "f64"} | tables.get("solver", {}) | more.get("solver", {}),
@@ -182,14 +177,10 @@ def poiseuille(y: np.ndarray, time: float) -> np.ndarray:
 def test_poiseuille(backend_of: Callable, record_property: Callable) -> None:
     """Gravity along a periodic channel starts the flow of the series, to second order."""
     backend, errors = backend_of("f64"), []
+    thick = LIQUID | {"density": 1000.0, "bulk_modulus": 1e5, "viscosity": 1000.0}
     for n in (8, 16):
         scene = scene_of(
-            block(
-                "fluid",
-                LIQUID | {"density": 1000.0, "bulk_modulus": 1e5, "viscosity": 1000.0},
-                [0.0, 0.0],
-                [8 / n, 1.0],
-            ),
+            block("fluid", thick, [0.0, 0.0], [8 / n, 1.0]),
             domain={"size": [8 / n, 1.0], "cells": [8, n], "gravity": [0.5, 0.0]},
             walls={"default": "stick", "x_min": "periodic", "x_max": "periodic"},
             end=0.15,

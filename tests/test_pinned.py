@@ -216,21 +216,18 @@ force = [1.0, 0.0]
 """
 
 
-@pytest.mark.parametrize(
-    ("good", "bad", "said"),
-    [
-        ('wall = "hold"', 'wall = "stick"\naxes = ["x"]', 'axes: is for wall = "hold", and wall is "stick"'),
-        ('wall = "hold"', 'wall = "hold"\naxes = []', "axes: must be some of x, y; found []"),
-        ('wall = "hold"', 'wall = "hold"\naxes = ["z"]', "axes: must be some of x, y; found ['z']"),
-        ('wall = "hold"', 'wall = "hold"\nfriction = 0.3', 'friction: is for a surface that slips or separates'),
-        ('wall = "hold"', 'wall = "hold"\ndensity = 10.0', 'wall: is "hold", which is for the inside'),
-        ('body = "block"\n', "", "body: missing key: the body that the force is spread over"),
-        ("force = [1.0, 0.0]", "", "acceleration: missing key: m/s^2, one entry per axis; or give force, N"),
-        ("force = [1.0, 0.0]", "force = [1.0, 0.0]\nregion = { ball = { center = [1.5, 0.5], radius = 0.1 } }",
-         "region: no particle starts there; move it or make it larger"),
-        ("force = [1.0, 0.0]", "force = [1.0, 0.0]\nregion = {}", "region: must be one of box and ball"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("good", "bad", "said"), [
+    ('wall = "hold"', 'wall = "stick"\naxes = ["x"]', 'axes: is for wall = "hold", and wall is "stick"'),
+    ('wall = "hold"', 'wall = "hold"\naxes = []', "axes: must be some of x, y; found []"),
+    ('wall = "hold"', 'wall = "hold"\naxes = ["z"]', "axes: must be some of x, y; found ['z']"),
+    ('wall = "hold"', 'wall = "hold"\nfriction = 0.3', 'friction: is for a surface that slips or separates'),
+    ('wall = "hold"', 'wall = "hold"\ndensity = 10.0', 'wall: is "hold", which is for the inside'),
+    ('body = "block"\n', "", "body: missing key: the body that the force is spread over"),
+    ("force = [1.0, 0.0]", "", "acceleration: missing key: m/s^2, one entry per axis; or give force, N"),
+    ("force = [1.0, 0.0]", "force = [1.0, 0.0]\nregion = { ball = { center = [1.5, 0.5], radius = 0.1 } }",
+     "region: no particle starts there; move it or make it larger"),
+    ("force = [1.0, 0.0]", "force = [1.0, 0.0]\nregion = {}", "region: must be one of box and ball"),
+])  # fmt: skip
 def test_each_bad_one_has_its_sentence(good: str, bad: str, said: str) -> None:
     (line,) = refusal(HOLD.replace(good, bad))
     assert said in line

@@ -31,18 +31,15 @@ MATERIALS = {
 CONFIGS = Path(__file__).parents[1] / "configs"
 
 
-@pytest.mark.parametrize(
-    ("name", "solver"),
-    [
-        ("dam_break_2d", {}),
-        # Deformation gradients, layers of bodies, rigid bodies, emitters with expressions, and meshes of colliders.
-        ("mixed_2d", {"precision": "f64"}),
-        ("rolling_3d", {}),
-        ("stirred_tank_2d", {"grid": "sparse"}),
-        ("fountain_2d", {}),
-        ("jelly_drop_2d", {"solids": "total"}),
-    ],
-)
+@pytest.mark.parametrize(("name", "solver"), [
+    ("dam_break_2d", {}),
+    # Deformation gradients, layers of bodies, rigid bodies, emitters with expressions, and meshes of colliders.
+    ("mixed_2d", {"precision": "f64"}),
+    ("rolling_3d", {}),
+    ("stirred_tank_2d", {"grid": "sparse"}),
+    ("fountain_2d", {}),
+    ("jelly_drop_2d", {"solids": "total"}),
+])  # fmt: skip
 def test_the_plan_is_what_taichi_allocates(backend_of: Callable, name: str, solver: dict) -> None:
     """Bytes of its trees of nodes, but for the alignment of each."""
     scene = load_scene(CONFIGS / f"{name}.toml", laws=parameter_models()).scene

@@ -96,16 +96,13 @@ def test_remainders(backend_of: Callable) -> None:
     assert (error <= 2.0**-23 * np.abs(way)[~held] + 2.0**-47).all()
 
 
-@pytest.mark.parametrize(
-    ("walls", "settings", "holds"),
-    [
-        ("slip", {}, False),
-        pytest.param("separate", {}, False, marks=pytest.mark.slow),
-        pytest.param("stick", {}, False, marks=pytest.mark.slow),
-        pytest.param("slip", {"transfer": "aflip"}, False, marks=pytest.mark.slow),
-        pytest.param("slip", {"kernel": "cubic"}, False, marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.parametrize(("walls", "settings", "holds"), [
+    ("slip", {}, False),
+    pytest.param("separate", {}, False, marks=pytest.mark.slow),
+    pytest.param("stick", {}, False, marks=pytest.mark.slow),
+    pytest.param("slip", {"transfer": "aflip"}, False, marks=pytest.mark.slow),
+    pytest.param("slip", {"kernel": "cubic"}, False, marks=pytest.mark.slow),
+])  # fmt: skip
 def test_folded_walls_hold_no_particle(backend_of: Callable, walls: str, settings: dict, holds: bool) -> None:
     """A block of liquid splashes in a corner, at the whole of the stable step: none is put on a wall of its domain."""
     scene = scene_of(

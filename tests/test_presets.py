@@ -272,20 +272,17 @@ def test_a_logarithmic_knob_has_no_end_at_zero():
         Knob("wrong", 0.0, 1.0, "0 is nothing")
 
 
-@pytest.mark.parametrize(
-    ("description", "unit"),
-    [
-        ("Young's modulus E, Pa.", "Pa"),
-        ("Viscosity, Pa s; water 1e-3.", "Pa s"),
-        ("Consistency, Pa s^n: the stress at unit rate.", "Pa s^n"),
-        ("Density at rest, kg/m^3.", "kg/m^3"),
-        ('Angle, degrees; "auto" is none.', "degrees"),
-        ("Speed, m/s", "m/s"),
-        ("Rate, 1/s (engineering).", ""),
-        ("A fraction, 0 to 1.", ""),
-        ("Poisson's ratio, between -1 and 0.5, both excluded.", ""),
-        (None, ""),
-    ],
-)
+@pytest.mark.parametrize(("description", "unit"), [
+    ("Young's modulus E, Pa.", "Pa"),
+    ("Viscosity, Pa s; water 1e-3.", "Pa s"),
+    ("Consistency, Pa s^n: the stress at unit rate.", "Pa s^n"),
+    ("Density at rest, kg/m^3.", "kg/m^3"),
+    ('Angle, degrees; "auto" is none.', "degrees"),
+    ("Speed, m/s", "m/s"),
+    ("Rate, 1/s (engineering).", ""),
+    ("A fraction, 0 to 1.", ""),
+    ("Poisson's ratio, between -1 and 0.5, both excluded.", ""),
+    (None, ""),
+])  # fmt: skip
 def test_units_are_read_from_descriptions(description, unit):
     assert unit_of(description) == unit

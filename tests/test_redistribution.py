@@ -30,15 +30,9 @@ def crowded(
     """Return bodies side by side that fill a domain, whose particles tests put elsewhere."""
     length = 1.0 if dimension == 2 else 0.6
     edges = np.linspace(0.0, length, len(materials) + 1)
-    high = [1.0] if dimension == 2 else [0.5, 0.5]
+    high, count = [1.0] if dimension == 2 else [0.5, 0.5], per_cell or 2**dimension
     bodies = [
-        block(
-            f"body {k}",
-            material,
-            [low] + [0.0] * (dimension - 1),
-            [edges[k + 1], *high],
-            particles_per_cell=per_cell or 2**dimension,
-        )
+        block(f"body {k}", material, [low, *[0.0] * len(high)], [edges[k + 1], *high], particles_per_cell=count)
         for k, (material, low) in enumerate(zip(materials, edges, strict=False))
     ]
     solver = {"precision": "f64", **solver}
@@ -236,13 +230,9 @@ def test_momenta_stay_where_drops_collide(backend_of: Callable) -> None:
     backend, spread = backend_of("f64", 1), []
     for moved in (0.0, 0.3 * 0.02):
         drops = [
-            body(
-                f"drop {1 + sign}",
-                WATER,
-                ball([1.5 + 0.25 * sign + moved, 1.5 + 0.05 * sign - moved], 0.2),
-                velocity=[-1.0 * sign, 0.0],
-            )
+            body(f"drop {1 + sign}", WATER, ball(center, 0.2), velocity=[-1.0 * sign, 0.0])
             for sign in (-1, 1)
+            for center in [[1.5 + 0.25 * sign + moved, 1.5 + 0.05 * sign - moved]]
         ]
         scene = scene_of(*drops, size=[3.0, 3.0], spacing=0.02, walls="separate", end=0.35, precision="f64")
         (_, before), (frame, after) = build_run(scene, backend).frames()

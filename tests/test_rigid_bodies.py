@@ -79,37 +79,29 @@ def test_moments_are_those_of_the_form() -> None:
     assert disc.center == pytest.approx((0.8, 0.8), abs=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("given", "said"),
-    [
-        ({"density": 0.0}, "colliders[0].density: must be greater than 0"),
-        ({"offset": ["0.1*t", "0"]}, "colliders[0].offset: is for a collider that moves as the scene says"),
-        ({"velocity": ["t", 0.0]}, "colliders[0].velocity: must be a number, that at the start"),
-        ({"side": "inside"}, "colliders[0].density: is for a shape with the material outside of it"),
-        ({"shape": plane([0.0, 0.1], [0.0, 1.0])}, "colliders[0].density: is for a shape"),
-        ({"mass": 3.0}, 'colliders[0].mass: "density" is given as well'),
-        ({"density": None, "mass": 0.0}, "colliders[0].mass: must be greater than 0"),
-        (
-            {"density": None, "fixed": ["x"]},
-            "colliders[0].fixed: is for one that moves freely; give its density or mass",
-        ),
-        ({"fixed": ["x", "y", "rotation"]}, "colliders[0].fixed: holds all of it; leave its density out"),
-        ({"fixed": ["z"]}, 'colliders[0].fixed: must be some of "x", "y" and "rotation" in 2D'),
-        ({"fixed": ["x"], "joint": {"type": "hinge"}}, 'colliders[0].fixed: "joint" is given as well'),
-        ({"fixed": ["x"], "velocity": [1.0, 2.0]}, "colliders[0].velocity: must be 0 along what joint or fixed holds"),
-        (
-            {"joint": {"type": "slider", "axis": [1, 1]}, "angular_velocity": 2.0},
-            "colliders[0].angular_velocity: must be 0 along",
-        ),
-        ({"joint": {"type": "hinge"}, "velocity": [1.0, 0.0]}, "colliders[0].velocity: follows from angular_velocity"),
-        ({"joint": {"type": "hinge", "axis": [0, 0, 1]}}, "axis: is for 3D scenes and this one is 2D"),
-        ({"joint": {"type": "hinge", "strength": 2.0}}, 'strength: is that of a motor; give "motor" as well'),
-        ({"joint": {"type": "slider"}}, "axis: missing"),
-        ({"joint": {"type": "weld"}}, 'colliders[0].joint.type: must be "hinge" or "slider"; found "weld"'),
-        ({"joint": {"point": [0.7, 0.5]}}, 'colliders[0].joint: missing key: type, "hinge" or "slider"'),
-        ({"restitution": 1.5}, "colliders[0].restitution: must be"),
-    ],
-)
+@pytest.mark.parametrize(("given", "said"), [
+    ({"density": 0.0}, "colliders[0].density: must be greater than 0"),
+    ({"offset": ["0.1*t", "0"]}, "colliders[0].offset: is for a collider that moves as the scene says"),
+    ({"velocity": ["t", 0.0]}, "colliders[0].velocity: must be a number, that at the start"),
+    ({"side": "inside"}, "colliders[0].density: is for a shape with the material outside of it"),
+    ({"shape": plane([0.0, 0.1], [0.0, 1.0])}, "colliders[0].density: is for a shape"),
+    ({"mass": 3.0}, 'colliders[0].mass: "density" is given as well'),
+    ({"density": None, "mass": 0.0}, "colliders[0].mass: must be greater than 0"),
+    ({"density": None, "fixed": ["x"]}, "colliders[0].fixed: is for one that moves freely; give its density or mass"),
+    ({"fixed": ["x", "y", "rotation"]}, "colliders[0].fixed: holds all of it; leave its density out"),
+    ({"fixed": ["z"]}, 'colliders[0].fixed: must be some of "x", "y" and "rotation" in 2D'),
+    ({"fixed": ["x"], "joint": {"type": "hinge"}}, 'colliders[0].fixed: "joint" is given as well'),
+    ({"fixed": ["x"], "velocity": [1.0, 2.0]}, "colliders[0].velocity: must be 0 along what joint or fixed holds"),
+    ({"joint": {"type": "slider", "axis": [1, 1]}, "angular_velocity": 2.0},
+     "colliders[0].angular_velocity: must be 0 along"),
+    ({"joint": {"type": "hinge"}, "velocity": [1.0, 0.0]}, "colliders[0].velocity: follows from angular_velocity"),
+    ({"joint": {"type": "hinge", "axis": [0, 0, 1]}}, "axis: is for 3D scenes and this one is 2D"),
+    ({"joint": {"type": "hinge", "strength": 2.0}}, 'strength: is that of a motor; give "motor" as well'),
+    ({"joint": {"type": "slider"}}, "axis: missing"),
+    ({"joint": {"type": "weld"}}, 'colliders[0].joint.type: must be "hinge" or "slider"; found "weld"'),
+    ({"joint": {"point": [0.7, 0.5]}}, 'colliders[0].joint: missing key: type, "hinge" or "slider"'),
+    ({"restitution": 1.5}, "colliders[0].restitution: must be"),
+])  # fmt: skip
 def test_what_cannot_move_freely_is_one_sentence(given: dict, said: str) -> None:
     with pytest.raises(InputError) as raised:
         scene(2, 0.0, {"shape": box([0.6, 0.4], [0.8, 0.6])} | given)

@@ -77,33 +77,28 @@ def test_a_container_has_its_material_inside() -> None:
     assert inside.signed_distance(np.array([[0.5, 0.9]])) == pytest.approx([0.4])
 
 
-@pytest.mark.parametrize(
-    ("collider", "said"),
-    [
-        ({"wall": "sticky"}, "colliders[0].wall"),
-        ({"wall": "open"}, 'colliders[0].wall: must be "slip", "stick", "separate" or "hold"'),
-        ({"wall": "stick", "friction": 0.2}, "colliders[0].friction: is for a surface that slips or separates"),
-        ({"friction": -1}, "colliders[0].friction: must be at least 0"),
-        ({"velocity": [1.0, 0.0], "offset": ["t", 0.0]}, 'colliders[0].offset: "velocity" is given as well'),
-        ({"angular_velocity": 1.0, "angle": "t"}, 'colliders[0].angle: "angular_velocity" is given as well'),
-        ({"velocity": [1.0, 0.0], "keyframes": [{"time": 0.0}]}, 'colliders[0].keyframes: "velocity" is given as well'),
-        ({"keyframes": [{"time": 1.0}, {"time": 1.0}]}, "colliders[0].keyframes: must have times that rise"),
-        ({"axis": [0, 0, 1]}, "colliders[0].axis: is for 3D scenes"),
-        ({"offset": ["floor(3*t)", 0.0]}, "colliders[0].offset[0]: jumps between 0 and time.end"),
-        ({"velocity": ["1/t", 0.0]}, "colliders[0].velocity[0]: must be finite from time 0 to time.end"),
-        ({"angle": "log(t)"}, "colliders[0].angle: must be finite"),
-        ({"shape": {}}, "colliders[0].shape: needs exactly one of"),
-        ({"shape": plane([0, 0], [0, 0])}, "must have a direction"),
-        (
-            {"shape": {"plane": {"point": [0, 0], "normal": [0, 1]}, "subtract": [BALL]}},
-            "colliders[0].shape.plane: is a shape alone; leave add and subtract out",
-        ),
-        ({"shape": ball([50.0, 0.5], 10.0)}, '"c0" (20 x 20 m) lies outside of the domain'),
-        ({"shape": polygon([[0, -1e9], [0.1, -1e9], [0.1, 0.1]])}, '"c0" spans 6e+10 cells, and 1e+08 is the most'),
-        ({"shape": ball([0.0, 0.0], 0.08)}, 'body "a" overlaps collider "c0" at the start'),
-        ({"speed": 1.0}, "colliders[0].speed"),
-    ],
-)
+@pytest.mark.parametrize(("collider", "said"), [
+    ({"wall": "sticky"}, "colliders[0].wall"),
+    ({"wall": "open"}, 'colliders[0].wall: must be "slip", "stick", "separate" or "hold"'),
+    ({"wall": "stick", "friction": 0.2}, "colliders[0].friction: is for a surface that slips or separates"),
+    ({"friction": -1}, "colliders[0].friction: must be at least 0"),
+    ({"velocity": [1.0, 0.0], "offset": ["t", 0.0]}, 'colliders[0].offset: "velocity" is given as well'),
+    ({"angular_velocity": 1.0, "angle": "t"}, 'colliders[0].angle: "angular_velocity" is given as well'),
+    ({"velocity": [1.0, 0.0], "keyframes": [{"time": 0.0}]}, 'colliders[0].keyframes: "velocity" is given as well'),
+    ({"keyframes": [{"time": 1.0}, {"time": 1.0}]}, "colliders[0].keyframes: must have times that rise"),
+    ({"axis": [0, 0, 1]}, "colliders[0].axis: is for 3D scenes"),
+    ({"offset": ["floor(3*t)", 0.0]}, "colliders[0].offset[0]: jumps between 0 and time.end"),
+    ({"velocity": ["1/t", 0.0]}, "colliders[0].velocity[0]: must be finite from time 0 to time.end"),
+    ({"angle": "log(t)"}, "colliders[0].angle: must be finite"),
+    ({"shape": {}}, "colliders[0].shape: needs exactly one of"),
+    ({"shape": plane([0, 0], [0, 0])}, "must have a direction"),
+    ({"shape": {"plane": {"point": [0, 0], "normal": [0, 1]}, "subtract": [BALL]}},
+     "colliders[0].shape.plane: is a shape alone; leave add and subtract out"),
+    ({"shape": ball([50.0, 0.5], 10.0)}, '"c0" (20 x 20 m) lies outside of the domain'),
+    ({"shape": polygon([[0, -1e9], [0.1, -1e9], [0.1, 0.1]])}, '"c0" spans 6e+10 cells, and 1e+08 is the most'),
+    ({"shape": ball([0.0, 0.0], 0.08)}, 'body "a" overlaps collider "c0" at the start'),
+    ({"speed": 1.0}, "colliders[0].speed"),
+])  # fmt: skip
 def test_faults_are_named(collider: dict, said: str) -> None:
     with pytest.raises(InputError) as caught:
         scene(collider)

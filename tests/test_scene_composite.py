@@ -125,19 +125,16 @@ def test_how_thick_and_how_far_apart() -> None:
     assert thickness(shell) == pytest.approx(0.5, abs=8 * RESOLUTION[3])
 
 
-@pytest.mark.parametrize(
-    ("shape", "said"),
-    [
-        ({**RING, "subtract": [{}]},
-        "shape.subtract[0]: needs exactly one of box, ball, capsule, cylinder, mesh, polygon; "),
-        ({**RING, "add": [box([0, 0], [0, 1])]}, "shape.add[0].box.max: must be above min along x"),
-        ({**RING, "add": [{**RING, "box": {}}]}, "shape.add[0].box.min: missing key: lower corner, m"),
-        ({**RING, "substract": []}, 'shape.substract: unknown key; did you mean "subtract"?'),
-        ({"subtract": [box([0, 0], [1, 1])]},
-        "shape: needs exactly one of box, ball, capsule, cylinder, mesh, polygon, points"),
-        ({**RING, "subtract": [box([0, 0], [1, 1])]}, 'body "b0" is too thin to hold a particle'),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("shape", "said"), [
+    ({**RING, "subtract": [{}]},
+    "shape.subtract[0]: needs exactly one of box, ball, capsule, cylinder, mesh, polygon; "),
+    ({**RING, "add": [box([0, 0], [0, 1])]}, "shape.add[0].box.max: must be above min along x"),
+    ({**RING, "add": [{**RING, "box": {}}]}, "shape.add[0].box.min: missing key: lower corner, m"),
+    ({**RING, "substract": []}, 'shape.substract: unknown key; did you mean "subtract"?'),
+    ({"subtract": [box([0, 0], [1, 1])]},
+    "shape: needs exactly one of box, ball, capsule, cylinder, mesh, polygon, points"),
+    ({**RING, "subtract": [box([0, 0], [1, 1])]}, 'body "b0" is too thin to hold a particle'),
+])  # fmt: skip
 def test_sentences(shape: dict, said: str) -> None:
     """What is wrong, at its path."""
     with pytest.raises(InputError) as caught:

@@ -25,17 +25,14 @@ def test_faces_have_their_coefficients(walls: object, friction: object, found: t
     assert scene(walls, friction).domain.frictions == found
 
 
-@pytest.mark.parametrize(
-    ("walls", "friction", "said"),
-    [
-        ("slip", -0.1, "domain.friction: must be at least 0; found -0.1"),
-        ("slip", "rough", "domain.friction: must be a number, or a table with one per face"),
-        ("slip", {"z_min": 0.2}, "domain.friction.z_min: is a face of a 3D scene and this one is 2D"),
-        ("slip", {"floor": 0.2}, "domain.friction.floor"),
-        ({"default": "slip", "y_min": "stick"}, {"y_min": 0.2}, "domain.friction.y_min: is for a wall that can slip"),
-        ("stick", 0.2, 'domain.friction: is for walls that can slip, and domain.walls has "stick" for all'),
-    ],
-)
+@pytest.mark.parametrize(("walls", "friction", "said"), [
+    ("slip", -0.1, "domain.friction: must be at least 0; found -0.1"),
+    ("slip", "rough", "domain.friction: must be a number, or a table with one per face"),
+    ("slip", {"z_min": 0.2}, "domain.friction.z_min: is a face of a 3D scene and this one is 2D"),
+    ("slip", {"floor": 0.2}, "domain.friction.floor"),
+    ({"default": "slip", "y_min": "stick"}, {"y_min": 0.2}, "domain.friction.y_min: is for a wall that can slip"),
+    ("stick", 0.2, 'domain.friction: is for walls that can slip, and domain.walls has "stick" for all'),
+])  # fmt: skip
 def test_faults_are_named(walls: object, friction: object, said: str) -> None:
     with pytest.raises(InputError) as caught:
         scene(walls, friction)

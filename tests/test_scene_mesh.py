@@ -352,13 +352,10 @@ def test_a_file_that_makes_no_closed_surface_is_named(tmp_path: Path, name: str)
         scene_of({"mesh": {"file": path}})
 
 
-@pytest.mark.parametrize(
-    ("name", "content"),
-    [
-        ("m.stl", b"hello"), ("m.obj", b"v 1 2 x\n"), ("m.ply", b"ply\n"), ("m.vtu", b"<VTK"), ("m.csv", b"1,2,3"),
-        ("m.stl", b""),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("name", "content"), [
+    ("m.stl", b"hello"), ("m.obj", b"v 1 2 x\n"), ("m.ply", b"ply\n"), ("m.vtu", b"<VTK"), ("m.csv", b"1,2,3"),
+    ("m.stl", b""),
+])  # fmt: skip
 def test_a_damaged_file_is_one_sentence_and_nothing_else(
     tmp_path: Path, capfd: pytest.CaptureFixture, name: str, content: bytes
 ) -> None:

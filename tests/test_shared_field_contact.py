@@ -33,16 +33,13 @@ def energies(rows: list) -> np.ndarray:
     return np.array([(row.kinetic + row.potential + row.elastic) / (row.mass * G * H) for row in rows])
 
 
-@pytest.mark.parametrize(
-    ("material", "offset", "sampling", "safety"),
-    [
-        slow(WATER, 0.0, "lattice", 0.8),
-        (WATER, 0.4, "lattice", 0.8),
-        (SAND, 0.3, "lattice", 0.8),
-        slow(WATER, 0.3, "jittered", 0.8),
-        slow(WATER, 0.4, "lattice", 0.4),
-    ],
-)
+@pytest.mark.parametrize(("material", "offset", "sampling", "safety"), [
+    slow(WATER, 0.0, "lattice", 0.8),
+    (WATER, 0.4, "lattice", 0.8),
+    (SAND, 0.3, "lattice", 0.8),
+    slow(WATER, 0.3, "jittered", 0.8),
+    slow(WATER, 0.4, "lattice", 0.4),
+])  # fmt: skip
 def test_what_falls_on_jelly_lies_on_its_surface(
     backend_of: Callable, material: dict, offset: float, sampling: str, safety: float, record_property: Callable
 ) -> None:
@@ -74,19 +71,16 @@ def test_a_jet_does_not_crush_the_surface_of_soft_jelly(backend_of: Callable) ->
     assert min(1000 / frame.fields["density"][frame.body == 0].max() for frame, _ in frames) > 0.42
 
 
-@pytest.mark.parametrize(
-    ("fall", "shift", "sampling", "safety", "off"),
-    [
-        # 0.134 cells too deep.
-        (0.0, 0.0, "lattice", 0.8, 0.15),
-        # 0.129 cells too deep.
-        slow(2.0, 0.0, "lattice", 0.8, 0.15),
-        slow(0.0, 0.3, "lattice", 0.8, 0.12),
-        # 0.186 cells.
-        slow(0.0, 0.0, "jittered", 0.8, 0.22),
-        slow(0.0, 0.0, "lattice", 0.4, 0.12),
-    ],
-)
+@pytest.mark.parametrize(("fall", "shift", "sampling", "safety", "off"), [
+    # 0.134 cells too deep.
+    (0.0, 0.0, "lattice", 0.8, 0.15),
+    # 0.129 cells too deep.
+    slow(2.0, 0.0, "lattice", 0.8, 0.15),
+    slow(0.0, 0.3, "lattice", 0.8, 0.12),
+    # 0.186 cells.
+    slow(0.0, 0.0, "jittered", 0.8, 0.22),
+    slow(0.0, 0.0, "lattice", 0.4, 0.12),
+])  # fmt: skip
 def test_a_block_of_jelly_floats_at_its_depth(
     backend_of: Callable, fall: float, shift: float, sampling: str, safety: float, off: float, record_property: Callable
 ) -> None:

@@ -93,17 +93,13 @@ def running(started: tuple[Run, SavedState, SavedState]) -> Run:
     return run
 
 
-@pytest.mark.parametrize(
-    ("law", "body", "value", "cause"),
-    [
-        ("fluid", "drop", np.nan, "not finite"),
-        ("fluid", "second drop", -0.5, "was inverted"),
-        ("fluid", "drop", 0.0, "was inverted"),
-        ("neo_hookean", "jelly", np.nan, "not finite"),
-        ("neo_hookean", "jelly", np.diag([-1.0, 1.0]), "was inverted"),
-    ],
-    ids=["J NaN", "J negative", "J zero", "F NaN", "F inverted"],
-)
+@pytest.mark.parametrize(("law", "body", "value", "cause"), [
+    ("fluid", "drop", np.nan, "not finite"),
+    ("fluid", "second drop", -0.5, "was inverted"),
+    ("fluid", "drop", 0.0, "was inverted"),
+    ("neo_hookean", "jelly", np.nan, "not finite"),
+    ("neo_hookean", "jelly", np.diag([-1.0, 1.0]), "was inverted"),
+], ids=["J NaN", "J negative", "J zero", "F NaN", "F inverted"])  # fmt: skip
 def test_a_lost_deformation_names_its_particle(running: Run, law: str, body: str, value: object, cause: str) -> None:
     """The very particle is named, before its stress spreads over its neighbours, one step later at most."""
     names = [b.name for b in running.scene.bodies if b.material.law == law]

@@ -236,20 +236,15 @@ def test_threads_change_no_byte(backend_of: Callable) -> None:
     assert own == rows
 
 
-@pytest.mark.parametrize(
-    ("changes", "said"),
-    [
-        ({"bodies": [("body", jelly()), ("other", jelly())]}, "it must be 0.3 m"),
-        (
-            {"bodies": [("body", jelly()), ("other", jelly(law="fixed_corotated"))]},
-            "is for bodies of one law; found fixed_corotated and neo_hookean",
-        ),
-        ({"bodies": [("body", {"law": "fluid", "density": 1e3, "bulk_modulus": 1e4})]}, "follows fluid"),
-        ({"deformation": [[1.1, 0.0], [0.0, 1.0]]}, "must be left out with solver.solids"),
-        ({"low": 0.05}, "begins 0.05 m from the wall y_min, which does not separate"),
-        ({"low": 0.3, "word": "stick"}, '"body" begins 0.3 m away, and would not stick to it later'),
-    ],
-)
+@pytest.mark.parametrize(("changes", "said"), [
+    ({"bodies": [("body", jelly()), ("other", jelly())]}, "it must be 0.3 m"),
+    ({"bodies": [("body", jelly()), ("other", jelly(law="fixed_corotated"))]},
+     "is for bodies of one law; found fixed_corotated and neo_hookean"),
+    ({"bodies": [("body", {"law": "fluid", "density": 1e3, "bulk_modulus": 1e4})]}, "follows fluid"),
+    ({"deformation": [[1.1, 0.0], [0.0, 1.0]]}, "must be left out with solver.solids"),
+    ({"low": 0.05}, "begins 0.05 m from the wall y_min, which does not separate"),
+    ({"low": 0.3, "word": "stick"}, '"body" begins 0.3 m away, and would not stick to it later'),
+])  # fmt: skip
 def test_what_cannot_be_on_that_grid_is_refused(changes: dict, said: str) -> None:
     low = changes.get("low", 0.0)
     bodies = [

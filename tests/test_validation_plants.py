@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 from conftest import ROOT
-from plants import PLANTS, SMALL_PLANTS, Plant
+from small_plants import PLANTS, SMALL_PLANTS, Plant
 
 from mpmcli.validation.case import Setting
 from mpmcli.validation.cases import all_cases

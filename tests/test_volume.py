@@ -220,14 +220,8 @@ def test_sand_follows_the_grid(backend_of: Callable, monkeypatch: pytest.MonkeyP
     monkeypatch.setenv(kernel_store.SWITCH, "off")
     sand = {"law": "sand", "density": 1600.0, "youngs_modulus": 1e6, "friction_angle": 30.0, "poissons_ratio": 0.3}
     bodies = [
-        block(
-            f"sand {k}",
-            {**sand, "volume_correction": k == 0},
-            [0.6 * k, 0.0],
-            [0.6 * (k + 1), 0.5],
-            sampling="jittered",
-        )
-        for k in (0, 1)
+        block(f"sand {k}", law, [0.6 * k, 0.0], [0.6 * (k + 1), 0.5], sampling="jittered")
+        for k, law in enumerate(sand | {"volume_correction": corrected} for corrected in (True, False))
     ]
     run = build_run(unshifted(scene([12, 8], H, bodies, 1.0, walls="slip", precision="f64")), backend_of("f64"))
     (group,) = run.groups

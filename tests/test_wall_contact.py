@@ -287,14 +287,11 @@ def worked(asked: Scene, backend: object) -> tuple[np.ndarray, np.ndarray, list]
     return (energy - energy[0]) / turned, np.cumsum([row.contact_work for row in rows]) / turned, rows
 
 
-@pytest.mark.parametrize(
-    "how",
-    [
-        ("post", 0.5, E, 0.0), ("post", 0.0, 30 * E, 0.3), ("wedge", 0.0, 30 * E, 0.0), ("ball", 0.5, 30 * E, 0.3),
-        ("edge", 0.5, E, 0.3), ("corner", 0.5, E, 0.3), slow(("corner", 0.0, 30 * E, 0.0)),
-        slow(("post", 0.5, E, 0.3, 2)), slow(("3D",)),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize("how", [
+    ("post", 0.5, E, 0.0), ("post", 0.0, 30 * E, 0.3), ("wedge", 0.0, 30 * E, 0.0), ("ball", 0.5, 30 * E, 0.3),
+    ("edge", 0.5, E, 0.3), ("corner", 0.5, E, 0.3), slow(("corner", 0.0, 30 * E, 0.0)),
+    slow(("post", 0.5, E, 0.3, 2)), slow(("3D",)),
+])  # fmt: skip
 def test_an_obstacle_makes_no_energy(backend_of: Callable, how: tuple) -> None:
     """Neither does contact give more than it has taken, at any time."""
     asked = on_a_post_in_3d() if how == ("3D",) else on_an_edge(*how)

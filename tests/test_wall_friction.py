@@ -132,15 +132,10 @@ def block_on_floor(
     theta, h = np.radians(degrees), HEIGHT / cells
     pull = [G * np.sin(theta), -G * np.cos(theta)]
     slowly = " + 0*t" if speed else "*(0.5 - 0.5*cos(pi*min(t/0.4, 1)))"
+    material = JELLY | ({"poissons_ratio": 0.0} if speed else {})
     weight = {"deformation": [[1, 0], [0, f"1 - {DENSITY * G / 1e6} * ({HEIGHT} - Y)"]]}
     return scene_of(
-        block(
-            "block",
-            JELLY | ({"poissons_ratio": 0.0} if speed else {}),
-            [0.5, 0.0],
-            [0.5 + LENGTH, HEIGHT],
-            velocity=[speed, 0.0],
-        )
+        block("block", material, [0.5, 0.0], [0.5 + LENGTH, HEIGHT], velocity=[speed, 0.0])
         | (weight if speed and solver.get("solids") != "total" else {}),
         size=[4 * LENGTH, 8 * h],
         spacing=h,
@@ -162,16 +157,13 @@ def history(backend: object, scene: Scene) -> np.ndarray:
     return np.array(found).T
 
 
-@pytest.mark.parametrize(
-    ("walls", "degrees", "friction", "solids"),
-    [
-        ("separate", 30.0, 0.3, "updated"),
-        slow("separate", 20.0, 0.2, "updated"),
-        slow("slip", 30.0, 0.1, "updated"),
-        ("separate", 30.0, 0.3, "total"),
-        slow("slip", 30.0, 0.1, "total"),
-    ],
-)
+@pytest.mark.parametrize(("walls", "degrees", "friction", "solids"), [
+    ("separate", 30.0, 0.3, "updated"),
+    slow("separate", 20.0, 0.2, "updated"),
+    slow("slip", 30.0, 0.1, "updated"),
+    ("separate", 30.0, 0.3, "total"),
+    slow("slip", 30.0, 0.1, "total"),
+])  # fmt: skip
 def test_a_block_slides_down_an_incline(
     backend_of: Callable, walls: str, degrees: float, friction: float, solids: str, record_property: Callable
 ) -> None:
