@@ -5,6 +5,7 @@ from itertools import product
 
 import numpy as np
 import pytest
+import scenes
 from scenes import block, scene, slow, volume_errors
 from scipy.stats import norm
 
@@ -295,7 +296,7 @@ def test_nodes_keep_volume_only_where_densities_differ(backend_of: Callable) -> 
 
 def uncorrected(tables: dict) -> Scene:
     bodies = [{**body, "material": {**body["material"], "volume_correction": False}} for body in tables["bodies"]]
-    return scene_of(**tables | {"contact": {}, "bodies": bodies})
+    return scenes.scene_of(**{"contact": {}} | tables | {"bodies": bodies})
 
 
 @pytest.mark.parametrize(

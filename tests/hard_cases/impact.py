@@ -6,7 +6,7 @@ import numpy as np
 from scenes import block
 
 from hard_cases.case import HardCase, Outcome
-from hard_cases.running import GRAVITY, growth, look, run, scene, start, with_springs
+from hard_cases.running import GRAVITY, growth, run, scene, start, with_springs
 from mpmcli.scene import sample_bodies
 from mpmcli.solver.frames.diagnosis import UnstableRunError
 
@@ -40,7 +40,7 @@ def impact() -> Outcome:
         rows, even = [], min(row.step_min for row in done.rows[1:])
         while solver.time < asked.time.end:
             solver.step(even)
-            rows.append(look(solver)[1])
+            rows.append(solver.frame()[1])
         steady = growth(with_springs(rows)) / done.energy[0]
         details.append(
             f"At {fraction:g} c J goes down to {done.ratios[0]:.2f}, energy up to {100 * over:.2f} % above its start; "

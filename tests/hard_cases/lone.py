@@ -9,7 +9,7 @@ import numpy as np
 from scenes import block
 
 from hard_cases.case import HardCase, Outcome
-from hard_cases.running import GRAVITY, look, run, scene, sound, start
+from hard_cases.running import GRAVITY, run, scene, sound, start
 from mpmcli.errors import InputError
 from mpmcli.scene import sample_bodies
 from mpmcli.solver.frames.diagnosis import NOT_FINITE, UnstableRunError
@@ -42,7 +42,7 @@ def droplets(steps: int) -> Outcome:
         for step in range(steps):
             run.step(dt)
             if step % (20 if step < 2000 else 500) == 0 or step == steps - 1:
-                frame, row = look(run)
+                frame, row = run.frame()
                 fine = fine and sound(frame, row)
                 worst = max(worst, row.speed_max / fall)
                 low, high = min(low, row.volume_ratio_min), max(high, row.volume_ratio_max)

@@ -6,7 +6,7 @@ import numpy as np
 from scenes import block
 
 from hard_cases.case import HardCase, Outcome
-from hard_cases.running import GRAVITY, look, run, scene, sound, start
+from hard_cases.running import GRAVITY, run, scene, sound, start
 from mpmcli.scene import sample_bodies
 
 H, SIDE = 0.1, 0.8
@@ -126,13 +126,13 @@ def steep_sand() -> Outcome:
     ratios = []
     while run.time < time:
         run.step(min(run.stable_step()[0] / 2, time - run.time + 1e-12))
-        frame, _ = look(run)
+        frame, _ = run.frame()
         stress = frame.fields["stress"].reshape(-1, 3, 3)[middle, :2, :2].astype(np.float64)
         s3, s1 = np.linalg.eigvalsh(stress).mean(0)
         ratios.append((s1 - s3) / -(s1 + s3))
     found = float(np.degrees(np.arcsin(min(1.0, ratios[-1]))))
     return Outcome(
-        sound(*look(run)) and abs(found - phi) < 0.5 and abs(ratios[-1] - ratios[-2]) < 1e-3,
+        sound(*run.frame()) and abs(found - phi) < 0.5 and abs(ratios[-1] - ratios[-2]) < 1e-3,
         f"yields at {found:.2f} degrees",
         f"After a shear of {100 * strain * 6:.1f} %; the ratio of stresses no longer changes.",
     )

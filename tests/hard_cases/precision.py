@@ -6,7 +6,7 @@ import numpy as np
 from scenes import block
 
 from hard_cases.case import HardCase, Outcome
-from hard_cases.running import GRAVITY, look, scene, sound, start
+from hard_cases.running import GRAVITY, scene, sound, start
 from mpmcli.errors import InputError
 from mpmcli.scene import sample_bodies
 
@@ -41,7 +41,7 @@ def stiff_cube() -> Outcome:
             for _ in range(steps):
                 run.step(crossing / steps)
             if crossings in (1, 10):
-                frame, row = look(run)
+                frame, row = run.frame()
                 fine = fine and sound(frame, row)
                 stresses[precision, crossings] = frame.fields["stress"].astype(np.float64)
     for crossings in (1, 10):
@@ -81,7 +81,7 @@ def far_origin() -> Outcome:
         dt = run.stable_step()[0]
         for _ in range(300):
             run.step(dt)
-        frame, row = look(run)
+        frame, row = run.frame()
         if not sound(frame, row):
             return Outcome(False, f"not finite at {origin:g} m")
         places[origin] = frame.position.astype(np.float64) - origin
@@ -117,7 +117,7 @@ def fast_spin() -> Outcome:
     for _ in range(steps // 10):
         for _ in range(10):
             run.step(dt)
-        frame, row = look(run)
+        frame, row = run.frame()
         fine = fine and sound(frame, row)
         low, high = min(low, row.volume_ratio_min), max(high, row.volume_ratio_max)
     bound = np.exp(turn**2 * steps)
@@ -134,10 +134,10 @@ def rest(steps: int) -> Outcome:
     bodies = [block("water", water, [0, 0], [0.5, 0.5]), block("rubber", RUBBER, [0.5, 0.0], [1.2, 0.7])]
     fields = ["velocity", "affine", "volume_ratio", "deformation_gradient"]
     run = start(scene(bodies, [16, 16], H, fields=fields))
-    before, _ = look(run)
+    before, _ = run.frame()
     for _ in range(steps):
         run.step(run.stable_step()[0])
-    after, row = look(run)
+    after, row = run.frame()
     same = np.array_equal(before.position, after.position) and np.array_equal(before.velocity, after.velocity)
     same = same and all(np.array_equal(before.fields[name], after.fields[name]) for name in before.fields)
     sliver = {"polygon": {"vertices": [[0.5, 0.5], [0.9, 0.6], [0.9, 0.599]]}}

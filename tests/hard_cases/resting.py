@@ -6,7 +6,7 @@ import numpy as np
 from scenes import block
 
 from hard_cases.case import HardCase, Outcome
-from hard_cases.running import GRAVITY, look, scene, sound, start
+from hard_cases.running import GRAVITY, scene, sound, start
 from mpmcli.scene import sample_bodies
 from mpmcli.solver.engine.run import Run
 
@@ -59,7 +59,7 @@ def jitter(precision: str) -> Outcome:
         while run.time < 2.0:
             for _ in range(20):
                 run.step(run.stable_step()[0])
-            frame, row = look(run)
+            frame, row = run.frame()
             fine = fine and sound(frame, row)
             if run.time > 1.0:
                 fastest = max(fastest, row.speed_max)
@@ -85,7 +85,7 @@ def block_at_rest(steps: int) -> Outcome:
     for part in range(1, 21):
         while run.step_count < part * steps // 20:
             run.step(run.stable_step()[0])
-        frame, row = look(run)
+        frame, row = run.frame()
         fine = fine and sound(frame, row)
         places.append(frame.position.astype(np.float64))
         kinetic.append(row.kinetic / scale)
@@ -121,7 +121,7 @@ def slosh(periods: int) -> Outcome:
     for part in range(4 * periods):
         while run.time < (part + 1) * period / 4:
             run.step(run.stable_step()[0])
-        frame, row = look(run)
+        frame, row = run.frame()
         fine = fine and sound(frame, row)
         centres.append(frame.position.astype(np.float64).mean(0))
         kinetic.append(row.kinetic)

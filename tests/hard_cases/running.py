@@ -43,11 +43,6 @@ def start(asked: Scene, particles: list[BodyParticles] | None = None) -> Run:
     return build_run(asked, start_backend("cpu", 1, asked.solver.precision), particles)
 
 
-def look(run: Run) -> tuple[Frame, LedgerRow]:
-    """Return the state of a run at this moment."""
-    return run.frame()
-
-
 def sound(frame: Frame, row: LedgerRow) -> bool:
     """Return whether every number of a frame is finite."""
     arrays = [frame.position, frame.velocity, *frame.fields.values()]

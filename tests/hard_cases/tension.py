@@ -6,7 +6,7 @@ import numpy as np
 from scenes import block
 
 from hard_cases.case import HardCase, Outcome
-from hard_cases.running import growth, look, nearest, run, scene, start
+from hard_cases.running import growth, nearest, run, scene, start
 from mpmcli.check.finding import FrameFindings
 from mpmcli.check.result_state import StretchCheck
 from mpmcli.output.header import RunHeader
@@ -149,7 +149,7 @@ def sheets() -> Outcome:
             for name, y, v in names
         ]
         solver = start(scene(bodies, [16, 16], H, end=4 * H / abs(speed), frames=80))
-        return solver, look(solver)[0].body
+        return solver, solver.frame()[0].body
 
     speed = 0.02 * WAVE_SPEED
     solver, body = pair(3 * H, -speed)

@@ -6,7 +6,7 @@ import numpy as np
 from scenes import block
 
 from hard_cases.case import HardCase, Outcome
-from hard_cases.running import look, scene, sound, start
+from hard_cases.running import scene, sound, start
 from mpmcli.frames.frame import Frame
 from mpmcli.scene import BodyParticles, Scene, sample_bodies
 from mpmcli.solver.engine.run import Run
@@ -68,7 +68,7 @@ def ringing(periods: int) -> Outcome:
     for period in range(1, periods + 1):
         while run.time < period * 2 * np.pi / w:
             run.step(run.stable_step()[0])
-        frame, row = look(run)
+        frame, row = run.frame()
         fine = fine and sound(frame, row)
         noise = max(noise, float(np.abs(frame.velocity - filtered(frame)).max()))
         # Kinetic and elastic energy share one amplitude.
@@ -91,7 +91,7 @@ def loss(run: Run, sample: BodyParticles, w: float, courant: float, periods: int
     for _ in range(periods + 1):
         for _ in range(steps):
             run.step(2 * np.pi / w / steps)
-        energies.append(look(run)[1].energy)
+        energies.append(run.frame()[1].energy)
     return float(1 - (energies[-1] / energies[0]) ** (1 / periods)), steps
 
 
