@@ -8,7 +8,7 @@ import pytest
 import state_run
 from conftest import GPU
 from rounding import farthest
-from scenes import ball, block, box, plane, polygon, slow
+from scenes import ball, block, box, plane, polygon, scene_of, slow
 from solver_state import with_colliders
 from tiny_sweep import tiny_sweep
 
@@ -16,8 +16,7 @@ from mpmcli.dataset.compute import Task, compute
 from mpmcli.errors import MpmcliError
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
-from mpmcli.materials.registry import parameter_models
-from mpmcli.scene import Scene, parse_scene
+from mpmcli.scene import Scene
 from mpmcli.solver.engine import run as engine_run
 from mpmcli.solver.engine.batch import Batch
 from mpmcli.solver.engine.compiled_kind import CompiledKind
@@ -129,27 +128,21 @@ def scene_named(name: str, other: bool = False) -> Scene:
         for k, law in enumerate(materials)
     ]
     cells = (17 if other else 20) if d == 2 else (11 if other else 12)
-    rough = (
-        {"friction": {"y_min": 0.4 - 0.1 * other, "x_max": 0.3 + 0.1 * other}}
-        if "rough" in name or "contact" in more
-        else {}
-    )
+    rough = {"friction": {"y_min": 0.4 - 0.1 * other, "x_max": 0.3 + 0.1 * other}}
+    rough = rough if "rough" in name or "contact" in more else {}
     if "a wall moves" in name:
         rough = {"friction": {"y_min": 0.4 - 0.1 * other}, "wall_velocity": {"y_min": [2.0 + other, 0.0]}}
-    data = {
-        "domain": {"size": [1.0] * d, "cells": [cells] * d, "gravity": [0.5 * other, -9.81, 0.0][:d]}
-        | more.get("domain", {})
-        | rough,
-        "time": {"end": 0.05 if other else 0.06, "frames": 3, "safety": 0.7 if other else 0.8},
-        "output": {"fields": ["velocity", "stress", "volume_ratio", "deformation_gradient"]},
-        "bodies": bodies,
-        "forces": [{"acceleration": a} | ({"body": body} if body else {}) for body, a in forces],
-        "solver": more.get("solver", {}),
-    }
-    data["contact"] = {"default": "stick"}
-    if "contact" in more:
-        data["contact"] = {"default": "separate", "friction": more["contact"] + 0.1 * other}
-    scene = parse_scene(data, laws=parameter_models(), source=name).scene
+    domain = {"size": [1.0] * d, "cells": [cells] * d, "gravity": [0.5 * other, -9.81, 0.0][:d]}
+    contact = {"default": "separate", "friction": more["contact"] + 0.1 * other} if "contact" in more else None
+    scene = scene_of(
+        *bodies,
+        domain=domain | more.get("domain", {}) | rough,
+        time={"end": 0.05 if other else 0.06, "frames": 3, "safety": 0.7 if other else 0.8},
+        fields=["velocity", "stress", "volume_ratio", "deformation_gradient"],
+        forces=[{"acceleration": a} | ({"body": body} if body else {}) for body, a in forces],
+        solver=more.get("solver", {}),
+        contact=contact or {"default": "stick"},
+    )
     # They stand in the material, where they meet it at once.
     made = colliders if more.get("colliders") else rigid if more.get("rigid") else lambda *_: []
     return with_colliders(scene, made(d, 1 + other))

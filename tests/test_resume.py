@@ -15,7 +15,7 @@ from command import SCENE, run_here
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_result import made_frame, made_header, made_row
-from scenes import block, box, liquid, solid
+from scenes import block, box, collider, liquid, solid, tables_of
 from test_checksums import flip, place_of
 from test_output_frames import make_frame
 from test_output_segments import fill
@@ -37,33 +37,27 @@ from mpmcli.solver.machine.backend import choose_backend, start, stop_backend
 SAND = {"law": "sand", "density": 1600.0, "youngs_modulus": 2e5, "poissons_ratio": 0.3, "friction_angle": 30.0}
 JELLY = solid(2e5, poissons_ratio=0.3)
 # Sand, water from an emitter, a paddle that turns ever faster, gravity that swings, an open face.
-CHANGING = {
-    "domain": {"size": [1.0, 1.0], "cells": [20, 20], "gravity": ["2*sin(9*t)", -9.81], "walls": {"y_max": "open"}},
-    "time": {"end": 0.4, "frames": 7},
-    "output": {"fields": ["velocity", "density"]},
-    "bodies": [block("sand", SAND, [0.1, 0.0], [0.6, 0.2])],
-    "emitters": [block("jet", liquid(2e4, volume_correction=True), [0.75, 0.7], [0.9, 0.75], velocity=[0.0, -1.5])],
-    "colliders": [
-        {
-            "name": "paddle",
-            "shape": box([0.3, 0.25], [0.5, 0.35]),
-            "wall": "slip",
-            "friction": 0.3,
-            "velocity": [0.3, "-0.5 + t"],
-            "angular_velocity": "20*t",
-        }
-    ],
-}
+PADDLE = {"wall": "slip", "friction": 0.3, "velocity": [0.3, "-0.5 + t"], "angular_velocity": "20*t"}
+CHANGING = tables_of(
+    block("sand", SAND, [0.1, 0.0], [0.6, 0.2]),
+    domain={"size": [1.0, 1.0], "cells": [20, 20], "gravity": ["2*sin(9*t)", -9.81], "walls": {"y_max": "open"}},
+    time={"end": 0.4, "frames": 7},
+    fields=["velocity", "density"],
+    emitters=[block("jet", liquid(2e4, volume_correction=True), [0.75, 0.7], [0.9, 0.75], velocity=[0.0, -1.5])],
+    colliders=[collider("paddle", box([0.3, 0.25], [0.5, 0.35]), **PADDLE)],
+    contact={},
+)
 # Two elastic bodies that collide on grids of their own.
-TOTAL = {
-    "domain": {"size": [1.0, 1.0], "cells": [16, 16]},
-    "time": {"end": 0.1, "frames": 4},
-    "solver": {"solids": "total"},
-    "bodies": [
+TOTAL = tables_of(
+    *(
         block(f"block {k}", JELLY, [0.1 + 0.5 * k, 0.3], [0.4 + 0.5 * k, 0.6], velocity=[2.0 - 4.0 * k, 0.0])
         for k in range(2)
-    ],
-}
+    ),
+    domain={"size": [1.0, 1.0], "cells": [16, 16]},
+    time={"end": 0.1, "frames": 4},
+    solids="total",
+    contact={},
+)
 # Stops at the n-th point where a run can stop, by SIGKILL.
 KILLED = """
 import os, signal, sys
