@@ -93,21 +93,9 @@ def scene_of(*bodies: dict, directory: str | PathLike[str] = ".", **keys: object
     return parse_scene(tables_of(*bodies, **keys), laws=parameter_models(), directory=directory).scene
 
 
-def scene(
-    cells: Sequence[int],
-    spacing: float,
-    bodies: Sequence[dict],
-    end: float,
-    *,
-    walls: object = "separate",
-    friction: object = 0.0,
-    precision: str = "f32",
-    fields: Sequence[str] = ("velocity",),
-    **keys: object,
-) -> Scene:
+def scene(cells: Sequence[int], spacing: float, bodies: Sequence[dict], end: float, **keys: object) -> Scene:
     """Return a scene with a number of cells."""
-    usual = {"walls": walls, "friction": friction, "precision": precision, "fields": list(fields)}
-    return scene_of(*bodies, cells=cells, spacing=spacing, end=end, **usual, **keys)
+    return scene_of(*bodies, **{"cells": cells, "spacing": spacing, "end": end, "fields": ["velocity"]} | keys)
 
 
 def tilted(degrees: float) -> list[float]:

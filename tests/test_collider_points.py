@@ -108,9 +108,7 @@ def test_points_that_do_not_act_are_counted_in_their_step(backend_of: Callable) 
         block("body", WATER, [5 * H, z], [27 * H, z + 6 * H]),
         domain={"size": [32 * H, 24 * H], "spacing": H, "gravity": [0.0, -G], "walls": {"default": "slip"}},
         time={"end": 0.24, "frames": 12, "safety": 0.25},
-        colliders=[
-            {"name": name, "shape": plane(list(map(float, y)), list(map(float, n)))} for name, (y, n) in planes.items()
-        ],
+        colliders=[{"name": name, "shape": plane(map(float, y), map(float, n))} for name, (y, n) in planes.items()],
     )
     frames = [frame for frame, _ in build_run(asked, backend_of("f32", 1)).frames()]
     assert min(((frame.position - middle) @ normal).min() for frame in frames) > 0
@@ -165,7 +163,7 @@ def vessel(
     """
     low, high = np.array([6.0, 4.0]) + offset, np.array([18.0, 24.0]) + offset
     outside, inside, filled = (
-        box(list((low - wall) * H), [(high[0] + wall) * H, top * H])
+        box((low - wall) * H, [(high[0] + wall) * H, top * H])
         for wall, top in ((thickness, high[1]), (0, high[1] + 1), (0, low[1] + 10))
     )
     shape = outside | {"subtract": [inside]}

@@ -126,7 +126,7 @@ def sand_on(degrees: float) -> tuple[Scene, np.ndarray]:
         body("s", sand, polygon([list(c) for c in corners])),
         domain={"size": [1.4, 1.4], "spacing": h, "gravity": [0.0, -G]},
         time={"end": 0.6, "frames": 6},
-        colliders=[{"name": "p", "shape": plane(list(start), list(normal)), "wall": "stick"}],
+        colliders=[{"name": "p", "shape": plane(start, normal), "wall": "stick"}],
     )
     return scene, down
 

@@ -271,7 +271,7 @@ def block_on_plane(
         domain={"size": [64 * h, 48 * h], "spacing": h, "gravity": [f"{x}{slowly}" for x in pull]},
         time={"end": end, "frames": 40},
         precision="f64",
-        colliders=[{"name": "slope", "shape": plane(list(point), list(normal)), "friction": friction}],
+        colliders=[{"name": "slope", "shape": plane(point, normal), "friction": friction}],
     )
     return scene, down, normal
 
@@ -349,7 +349,7 @@ def test_momentum_goes_to_the_colliders(backend_of: Callable) -> None:
         time={"end": 0.5, "frames": 5},
         precision="f64",
         colliders=[
-            {"name": "ball", "shape": ball(list(centers[0]), 0.25), "friction": 0.3},
+            {"name": "ball", "shape": ball(centers[0], 0.25), "friction": 0.3},
             collider(
                 "paddle", box([1.3, 0.6], [1.4, 1.3]), angular_velocity="2 + 0*t", velocity=["0*t", 0.0], wall="stick"
             ),

@@ -93,7 +93,6 @@ def test_the_plan_counts_what_the_host_holds(tmp_path: Path, fields: list[str]) 
         block("block", MATERIALS["fluid"], [0.2, 0.2], [0.6, 0.6]),
         domain={"size": [1.0, 1.0], "spacing": h, "gravity": [0.0, -9.81]},
         time={"end": 4e-6, "frames": 2, "step": 2e-6},
-        precision="f32",
         fields=fields,
     )
     stop_backend()

@@ -54,7 +54,7 @@ def test_in_3d_27_particles_per_cell():
 )
 def test_a_box_of_any_size_is_filled_evenly(lower, extent, jittered):
     upper = [lo + e for lo, e in zip(lower, extent, strict=True)]
-    body = {"shape": box(list(lower), upper), "sampling": "jittered" if jittered else "lattice"}
+    body = {"shape": box(lower, upper), "sampling": "jittered" if jittered else "lattice"}
     scene = scene_of(body)
     (particles,) = sample_bodies(scene)
     assert particles.count == estimate_particles(scene)
