@@ -7,7 +7,7 @@ import mpm_reference as reference
 import numpy as np
 import pytest
 from contact_scenes import DENSITY, LAMBDA, MU, NU, E, jelly
-from elastic_bodies import H, body_scene, stirred
+from elastic_bodies import H, bars, body_scene, stirred
 from law_probe import LawProbe
 from law_tangent import unit_gradients
 from scenes import block, body, scene_of
@@ -17,7 +17,6 @@ from mpmcli.materials.law import StateBound
 from mpmcli.materials.registry import laws
 from mpmcli.scene import sample_bodies
 from mpmcli.solver.engine.run import build_run
-from mpmcli.solver.machine.backend import Backend
 
 # Of the domains of free bodies, which share a kernel.
 CELLS = [40, 40]
@@ -219,21 +218,16 @@ def test_no_state_is_stiffer_than_its_bound(backend_of: Callable, law: str, dime
     assert (stiffest <= bounds * (1 + 1e-6)).all()
 
 
-def small_run(backend: Backend) -> tuple[np.ndarray, list]:
-    """Return the last positions, and the ledger, of a body that falls on a floor, turning."""
-    own = block("body", jelly(), [0.4, 0.2], [0.9, 0.6], velocity_gradient=[[0.0, 2.0], [-2.0, 0.0]])
-    gravity, precision = [0.5, -9.81], backend.precision
-    scene = body_scene(own, [16, 10], gravity=gravity, end=0.3, frames=3, precision=precision)
-    found = list(build_run(scene, backend).frames())
-    return found[-1][0].position, [row for _, row in found]
-
-
 @pytest.mark.slow
-def test_threads_change_no_byte(backend_of: Callable) -> None:
-    expected, rows = small_run(backend_of("f32", 1))
-    found, own = small_run(backend_of("f32", 3))
-    assert found.tobytes() == expected.tobytes()
-    assert own == rows
+@pytest.mark.parametrize("asked", ["a body that falls on a floor, turning", "two bars that meet"])
+def test_threads_change_no_byte(backend_of: Callable, asked: str) -> None:
+    """Of the last positions and of the ledger."""
+    own = block("body", jelly(), [0.4, 0.2], [0.9, 0.6], velocity_gradient=[[0.0, 2.0], [-2.0, 0.0]])
+    scene = body_scene(own, [16, 10], gravity=[0.5, -9.81], end=0.3, frames=3, precision="f32")
+    scene = bars(16, 0.25, precision="f32", frames=5) if asked == "two bars that meet" else scene
+    one, several = (list(build_run(scene, backend_of("f32", threads)).frames()) for threads in (1, 3))
+    assert one[-1][0].position.tobytes() == several[-1][0].position.tobytes()
+    assert [row for _, row in one] == [row for _, row in several]
 
 
 @pytest.mark.parametrize(("changes", "said"), [

@@ -15,7 +15,7 @@ from mpmcli.materials.sand import RELAXATION as GRAINS_RELAXATION
 from mpmcli.scene import Scene, sample_bodies
 from mpmcli.solver.engine import kernel_store
 from mpmcli.solver.engine.plan import make_plan
-from mpmcli.solver.engine.run import build_run
+from mpmcli.solver.engine.run import Run, build_run
 from mpmcli.solver.transfer.splines import PAD
 from mpmcli.stability.transfer_factors import INTERVAL
 from mpmcli.validation.case import Setting
@@ -147,6 +147,22 @@ def test_openings_are_remembered(backend_of: Callable) -> None:
         assert (np.abs(grown(before, C, dt) - free)[body == 0] > 1e-5).any() == (sign < 0)
 
 
+# For how long nothing was relaxed before the step of `stepped`, s.
+UNRELAXED = 2e-3
+
+
+def stepped(run: Run, dt: float) -> tuple[dict, dict, dict]:
+    """Return a law's particles, and those after a step that relaxes volumes, and after one that does not."""
+    saved, found = run.save().copied(), [run.groups[0].read()]
+    for steps in (INTERVAL - 1, 0):
+        run.load(saved)
+        run.state.unrelaxed_steps = steps
+        run.state.unrelaxed = UNRELAXED
+        run.step(dt)
+        found.append(run.groups[0].read())
+    return tuple(found)
+
+
 @pytest.mark.parametrize(
     ("densities", "walls", "d"),
     [
@@ -175,19 +191,10 @@ def test_volume_follows_the_grid(
     group.replace(x=group.read()["x"] * [1.0, 0.85, 1.0][:d], deformation=random.uniform(0.7, 1.2, group.count))
     run.state_was_replaced()
     run.step(1e-4)
-    saved = run.save().copied()
-    before = group.read()
-    found = []
-    for steps in (INTERVAL - 1, 0):
-        run.load(saved)
-        run.state.unrelaxed_steps = steps
-        run.state.unrelaxed = time = 2e-3
-        run.step(1e-4)
-        found.append(group.read())
-    relaxed, plain = found
+    before, relaxed, plain = stepped(run, 1e-4)
     volume = np.array([b.volume for b in sample_bodies(run.scene)])[before["body"]]
     seen, least, beside = seen_ratio(before["x"], volume, run.scene.domain.cells)
-    crossings = np.sqrt(BULK / np.array(densities))[before["body"]] * (time + 1e-4) / H
+    crossings = np.sqrt(BULK / np.array(densities))[before["body"]] * (UNRELAXED + 1e-4) / H
     J = before["deformation"]
     moves = (least > FULL) & ((seen < J) | (beside * seen > BESIDE))
     gap = (seen - J) * moves
@@ -237,16 +244,7 @@ def test_sand_follows_the_grid(backend_of: Callable, monkeypatch: pytest.MonkeyP
     group.replace(deformation=np.exp(strain / 2)[:, None, None] * np.eye(2), internal=np.stack([opened, 0 * opened], 1))
     # What is at rest stays as it is.
     group.replace(v=np.zeros((group.count, 2)), C=random.normal(size=(group.count, 2, 2)))
-    saved = run.save().copied()
-    before = group.read()
-    found = []
-    for steps in (INTERVAL - 1, 0):
-        run.load(saved)
-        run.state.unrelaxed_steps = steps
-        run.state.unrelaxed = time = 2e-3
-        run.step(1e-5)
-        found.append(group.read())
-    relaxed, plain = found
+    before, relaxed, plain = stepped(run, 1e-5)
     x, body = before["x"], before["body"]
     volume = np.array([b.volume for b in sample_bodies(run.scene)])[body]
     filled, slope = filling(x, volume, run.scene.domain.cells)
@@ -255,7 +253,7 @@ def test_sand_follows_the_grid(backend_of: Callable, monkeypatch: pytest.MonkeyP
     narrow = 1 / 2 - 1 / 30
     z = np.sqrt(-4 * narrow * np.log(np.clip(slope * np.sqrt(2 * np.pi * narrow), 1e-6, 1)))
     below = np.log(norm.cdf(z))
-    crossings = np.sqrt(sound_modulus(1e6, 0.3) / 1600.0) * (time + 1e-5) / H
+    crossings = np.sqrt(sound_modulus(1e6, 0.3) / 1600.0) * (UNRELAXED + 1e-5) / H
     share = np.where(strain < 0, GRAINS_RELAXATION * crossings / (1 + GRAINS_RELAXATION * crossings), 1.0)
     opening = np.maximum(np.minimum(gap, np.log(seen)) + below, 0) * share
     closing = np.minimum(gap + BAND, 0)
