@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from scenes import body, box
 from solver_state import scene_of
 
 from mpmcli.check.finding import Finding
@@ -13,35 +14,18 @@ FLUID = {"law": "fluid", "density": 1000.0, "bulk_modulus": 1e6}
 SOLID = {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 1e6}
 
 
-def box(low: list[float], high: list[float]) -> dict[str, Any]:
-    """Return the shape of a box."""
-    return {"box": {"min": low, "max": high}}
-
-
 def loaded(
-    bodies: list[dict[str, Any]] | None = None,
-    *,
-    material: dict[str, Any] = FLUID,
-    shape: dict[str, Any] | None = None,
-    domain: dict[str, Any] | None = None,
-    time: dict[str, Any] | None = None,
-    solver: dict[str, Any] | None = None,
-    output: dict[str, Any] | None = None,
-    contact: dict[str, Any] | None = None,
-    colliders: list[dict[str, Any]] | None = None,
-    **body: Any,
+    bodies: list[dict] | None = None, *, material: dict = FLUID, shape: dict | None = None, **keys: Any
 ) -> LoadedScene:
-    """Return a scene: by default a block of 16 x 16 cells of fluid on the floor of 64 x 64 cells, h = 1/64 m."""
-    block = {"name": "block", "material": material, "shape": shape or box([0.25, 0.0], [0.5, 0.25]), **body}
-    scene = scene_of(
-        domain={"size": [1.0, 1.0], "cells": [64, 64], "gravity": [0.0, -10.0], "walls": "slip"} | (domain or {}),
-        time={"end": 0.5, "frames": 10} | (time or {}),
-        solver=solver or {},
-        output=output or {},
-        contact=contact or {},
-        colliders=colliders or [],
-        bodies=bodies or [block],
-    )
+    """Return a scene: by default a block of 16 x 16 cells of fluid on the floor of 64 x 64 cells, h = 1/64 m.
+
+    What is no table of a scene is a key of the block.
+    """
+    domain = {"size": [1.0, 1.0], "cells": [64, 64], "gravity": [0.0, -10.0], "walls": "slip"}
+    asked = {name: keys.pop(name) or {} for name in Scene.model_fields if name in keys}
+    domain, time = domain | asked.pop("domain", {}), {"end": 0.5, "frames": 10} | asked.pop("time", {})
+    own = body("block", material, shape or box([0.25, 0.0], [0.5, 0.25]), **keys)
+    scene = scene_of(*bodies or [own], domain=domain, time=time, **{"contact": {}} | asked)
     return LoadedScene(scene, (), "scene.toml")
 
 

@@ -5,7 +5,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -61,6 +61,15 @@ class PythonRun:
     stderr: str
 
 
+def python(
+    words: Sequence[object], stdin: str = "", environment: Mapping[str, str] | None = None, **how: object
+) -> PythonRun:
+    path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
+    process, how = [sys.executable, *map(str, words)], {"capture_output": True, "text": True, "timeout": 300} | how
+    done = subprocess.run(process, input=stdin, env={**os.environ, "PYTHONPATH": path, **(environment or {})}, **how)
+    return PythonRun(done.returncode, done.stdout, done.stderr)
+
+
 @pytest.fixture
 def run_python(tmp_path: Path) -> Callable[..., PythonRun]:
     """Return `run(code_or_arguments, ...)`: it runs Python in a process of its own and returns a PythonRun.
@@ -80,20 +89,11 @@ def run_python(tmp_path: Path) -> Callable[..., PythonRun]:
         timeout: float = 300,
         environment: dict[str, str] | None = None,
     ) -> PythonRun:
-        arguments = ["-c", code_or_arguments] if isinstance(code_or_arguments, str) else code_or_arguments
-        path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
-        done = subprocess.run(
-            [sys.executable, *map(str, arguments)],
-            input=stdin if stdin is not None else "",
-            capture_output=True,
-            text=True,
-            cwd=cwd,
-            timeout=timeout,
-            env={**os.environ, "PYTHONPATH": path, **(environment or {})},
-        )
-        if check and done.returncode != 0:
-            pytest.fail(f"python exited with {done.returncode}:\n{done.stdout}\n{done.stderr}")
-        return PythonRun(done.returncode, done.stdout, done.stderr)
+        words = ["-c", code_or_arguments] if isinstance(code_or_arguments, str) else code_or_arguments
+        done = python(words, stdin or "", environment, cwd=cwd, timeout=timeout)
+        if check and done.status != 0:
+            pytest.fail(f"python exited with {done.status}:\n{done.stdout}\n{done.stderr}")
+        return done
 
     return run
 
@@ -101,19 +101,7 @@ def run_python(tmp_path: Path) -> Callable[..., PythonRun]:
 @pytest.fixture(scope="session")
 def run_module() -> Callable[..., PythonRun]:
     """Return `run(file, *arguments)`: a Python file in a process of its own, with any exit status."""
-
-    def run(file: Path, *arguments: object) -> PythonRun:
-        path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
-        done = subprocess.run(
-            [sys.executable, str(file), *map(str, arguments)],
-            capture_output=True,
-            text=True,
-            timeout=300,
-            env={**os.environ, "PYTHONPATH": path},
-        )
-        return PythonRun(done.returncode, done.stdout, done.stderr)
-
-    return run
+    return lambda file, *arguments: python([file, *arguments])
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -93,12 +93,7 @@ class Obstacle:
 
 
 def exchange(
-    momenta: list[np.ndarray],
-    masses: list[np.ndarray],
-    surfaces: list[Surface],
-    box: Box,
-    dt: float,
-    friction: float,
+    momenta: list[np.ndarray], masses: list[np.ndarray], surfaces: list[Surface], box: Box, dt: float, friction: float
 ) -> int:
     """Let two bodies with these momenta (..., d) and masses (...) push each other; return at how many nodes."""
     h, pushed, (a, c) = box.spacing, 0, surfaces

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import tomli_w
+from scenes import body
 
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
@@ -37,34 +38,23 @@ def header(
         "domain": {"size": list(size), "spacing": spacing, "gravity": [*[0.0] * (d - 1), -9.81]},
         "time": {"end": 1.0, "frames": 10},
         "bodies": [
-            {"name": name, "shape": box, "material": material, "particles_per_cell": 2**d}
-            for name, material in zip(names, materials, strict=True)
+            body(name, material, box, particles_per_cell=2**d) for name, material in zip(names, materials, strict=True)
         ],
     }
     if colliders:
         scene["colliders"] = list(colliders)
     laws = sorted({material["law"] for material in materials})
     facts = {
-        "title": scene["title"],
-        "dimension": d,
-        "spacing": spacing,
-        "origin": [0.0] * d,
-        "size": list(size),
-        "bodies": names,
-        "materials": laws,
+        "title": scene["title"], "dimension": d, "spacing": spacing, "origin": [0.0] * d, "size": list(size),
+        "bodies": names, "materials": laws,
         "laws": [{"deformation": "J" if law == "fluid" else "F", "coherent": False} for law in laws],
-        "precision": "f32",
-        "scene": tomli_w.dumps(scene),
-    }
+        "precision": "f32", "scene": tomli_w.dumps(scene),
+    }  # fmt: skip
     return {**facts, **more}
 
 
 def frame(
-    k: int,
-    position: np.ndarray,
-    body: np.ndarray | int = 0,
-    velocity: np.ndarray | None = None,
-    **fields: np.ndarray,
+    k: int, position: np.ndarray, body: np.ndarray | int = 0, velocity: np.ndarray | None = None, **fields: np.ndarray
 ) -> Frame:
     """Frame k, at t = k/100 s."""
     position = np.asarray(position, dtype=np.float32)

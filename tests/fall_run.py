@@ -8,7 +8,7 @@ import sys
 
 import numpy as np
 from path_run import NO_DEVICE
-from solver_state import scene_of
+from scenes import block, scene_of
 
 from mpmcli.errors import InputError
 from mpmcli.scene import Scene
@@ -22,15 +22,9 @@ GRAVITY, SECONDS, H = 9.81, 0.5, 0.05
 def soft_block() -> Scene:
     """Return a block that falls from rest, so soft that gravity alone moves it by cells within a few steps."""
     return scene_of(
+        block("block", {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 1e3}, [0.35, 1.6], [0.65, 1.9]),
         domain={"size": [1.0, 2.0], "spacing": H, "gravity": [0.0, -GRAVITY]},
-        time={"end": SECONDS, "frames": 1},
-        bodies=[
-            {
-                "name": "block",
-                "material": {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 1e3},
-                "shape": {"box": {"min": [0.35, 1.6], "max": [0.65, 1.9]}},
-            }
-        ],
+        end=SECONDS,
     )
 
 

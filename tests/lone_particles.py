@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from solver_state import scene_of
+from scenes import block, scene_of
 
 from mpmcli.check.facts import SceneFacts
 from mpmcli.frames.ledger import LedgerRow
@@ -64,16 +64,10 @@ def _asked(
 ) -> tuple[Scene, list[BodyParticles]]:
     count, keeps_J = len(places), material["law"] == "fluid"
     J, volume = float(np.linalg.det(F)), H * H / 4
-    box = {"min": [0.8, 0.8], "max": [0.8 + H * max(count, 1), 0.9]}
-    body = {
-        "name": "body",
-        "material": dict(material),
-        "shape": {"box": box},
-        "particles_per_cell": 1,
-        "deformation": J if keeps_J else F.tolist(),
-    }
+    more = {"particles_per_cell": 1, "deformation": J if keeps_J else F.tolist()}
+    body = block("body", dict(material), [0.8, 0.8], [0.8 + H * max(count, 1), 0.9], **more)
     domain = {"size": [1.7, 1.7], "cells": [17, 17]}
-    scene = scene_of(domain=domain, time={"end": 1.0, "frames": FRAMES}, bodies=[body])
+    scene = scene_of(body, domain=domain, frames=FRAMES)
     end = steps * SceneFacts(scene).step_at_start
     scene = scene.model_copy(update={"time": scene.time.model_copy(update={"end": end})})
     deformation = np.full(count, J) if keeps_J else np.tile(F, (count, 1, 1))

@@ -14,15 +14,8 @@ SPLITS = ("train", "train", "valid", "test")
 COUNTS = (30, 24, 36, 24)
 SCENE = """\
 title = "Two that drift"
-[domain]
-origin = [{origin}]
-size = [{size}]
-walls = {{ {walls} }}
-spacing = 0.05
-gravity = [{gravity}]
-[time]
-end = 0.1
-frames = 10
+domain = {{ origin = [{origin}], size = [{size}], walls = {{ {walls} }}, spacing = 0.05, gravity = [{gravity}] }}
+time = {{ end = 0.1, frames = 10 }}
 [[bodies]]
 name = "pool"
 particles_per_cell = {cell}
@@ -59,19 +52,11 @@ def made_header(
         density=density,
     )
     return {
-        "version": "0",
-        "title": "Two that drift",
-        "dimension": dimension,
-        "spacing": 0.05,
-        "origin": [origin] * dimension,
-        "size": [1.0] * dimension,
-        "bodies": ["pool", "heap"],
-        "materials": list(LAWS),
-        "laws": [{"deformation": "J", "coherent": False}, {"deformation": "F", "coherent": False}],
-        "precision": "f32",
-        "backend": {"arch": "cpu", "threads": 1, "precision": "f32"},
-        "scene": text,
-    }
+        "version": "0", "title": "Two that drift", "dimension": dimension, "spacing": 0.05,
+        "origin": [origin] * dimension, "size": [1.0] * dimension, "bodies": ["pool", "heap"], "materials": list(LAWS),
+        "laws": [{"deformation": "J", "coherent": False}, {"deformation": "F", "coherent": False}], "precision": "f32",
+        "backend": {"arch": "cpu", "threads": 1, "precision": "f32"}, "scene": text,
+    }  # fmt: skip
 
 
 def made_row(k: int, dimension: int) -> LedgerRow:

@@ -14,14 +14,9 @@ MASS, STEP, PAUSE = 2.0, 0.002, 0.02
 LIMITS = ("wave", "speed", "viscosity")
 SCENE = """\
 title = "Two that fall"
+domain = {{ size = [{size}], spacing = 0.05, gravity = [{gravity}] }}
+time = {{ end = 0.1, frames = 5 }}
 {more}
-[domain]
-size = [{size}]
-spacing = 0.05
-gravity = [{gravity}]
-[time]
-end = 0.1
-frames = 5
 """
 
 
@@ -30,17 +25,11 @@ def made_header(dimension: int, *, driven: bool = False) -> dict:
     gravity = ", ".join(["0.0"] * (dimension - 1) + [f"-{GRAVITY}"])
     more = '[[forces]]\nacceleration = ["1.0"]' if driven else ""
     return {
-        "title": "Two that fall",
-        "dimension": dimension,
-        "spacing": 0.05,
-        "origin": [0.0] * dimension,
-        "size": [1.0] * dimension,
-        "bodies": ["left", "right"],
-        "materials": ["fluid"],
-        "laws": [{"deformation": "J", "coherent": False, "projects": False}],
-        "precision": "f32",
+        "title": "Two that fall", "dimension": dimension, "spacing": 0.05, "origin": [0.0] * dimension,
+        "size": [1.0] * dimension, "bodies": ["left", "right"], "materials": ["fluid"],
+        "laws": [{"deformation": "J", "coherent": False, "projects": False}], "precision": "f32",
         "scene": SCENE.format(more=more, size=", ".join(["1.0"] * dimension), gravity=gravity),
-    }
+    }  # fmt: skip
 
 
 def made_frame(k: int, dimension: int) -> Frame:
@@ -64,22 +53,13 @@ def made_row(k: int, dimension: int, **changes: object) -> LedgerRow:
     speed = GRAVITY * max(time - STEP / 2, 0.0)
     momentum = (*[0.0] * (dimension - 1), -MASS / 2 * speed)
     values = {
-        "time": time,
-        "steps": 10 if k else 0,
-        "step_min": STEP * (0.9 if k == 2 else 1.0) if k else 0.0,
-        "step_max": STEP * (1.1 if k == 2 else 1.0) if k else 0.0,
-        "limit": LIMITS[k % len(LIMITS)] if k else "",
-        "speed_max": speed,
-        "courant_max": 0.01 * k,
-        "volume_ratio_min": 1.0 - 0.01 * k,
-        "volume_ratio_max": 1.0 + 0.02 * k,
-        "mass": MASS,
-        "kinetic": MASS / 4 * speed**2,
-        "elastic": 0.1 * k,
-        "potential": 20.0 - MASS / 4 * (GRAVITY * time) ** 2,
-        "linear_momentum": momentum,
+        "time": time, "steps": 10 if k else 0, "step_min": STEP * (0.9 if k == 2 else 1.0) if k else 0.0,
+        "step_max": STEP * (1.1 if k == 2 else 1.0) if k else 0.0, "limit": LIMITS[k % len(LIMITS)] if k else "",
+        "speed_max": speed, "courant_max": 0.01 * k, "volume_ratio_min": 1.0 - 0.01 * k,
+        "volume_ratio_max": 1.0 + 0.02 * k, "mass": MASS, "kinetic": MASS / 4 * speed**2, "elastic": 0.1 * k,
+        "potential": 20.0 - MASS / 4 * (GRAVITY * time) ** 2, "linear_momentum": momentum,
         "angular_momentum": (0.3 * k,) if dimension == 2 else (0.1 * k, 0.2 * k, 0.3 * k),
-    }
+    }  # fmt: skip
     return LedgerRow(**(values | changes))
 
 

@@ -2,10 +2,15 @@
 
 import mpm_reference as reference
 import numpy as np
+import path_run
+from rounding import OF_A_STEP
 
 from mpmcli.scene import Scene, sample_bodies
+from mpmcli.solver.transfer.splines import PAD
 
 Arrays = dict[str, np.ndarray]
+# Round-off of a step relative to the largest value of each array.
+TOLERANCE = {"f32": OF_A_STEP, "f64": 1e-12}
 
 
 def reference_groups(scene: Scene, arrays: Arrays, k: int) -> list[reference.Particles]:
@@ -41,12 +46,7 @@ def reference_groups(scene: Scene, arrays: Arrays, k: int) -> list[reference.Par
 
 
 def check_nodes(
-    nodes: np.ndarray,
-    momentum: np.ndarray,
-    mass: np.ndarray,
-    velocity: np.ndarray,
-    fall: np.ndarray,
-    tolerance: float,
+    nodes: np.ndarray, momentum: np.ndarray, mass: np.ndarray, velocity: np.ndarray, fall: np.ndarray, tolerance: float
 ) -> None:
     """Compare the momentum and the mass that P2G left, where no wall folds, and every node's velocity.
 
@@ -64,3 +64,43 @@ def check_nodes(
     moving = np.abs(velocity).max()
     at = mass > 0
     assert (weight[at][:, None] * np.abs(nodes[at][:, :-1] - velocity[at])).max() < tolerance * moving
+
+
+# Paths that agree to the last bit start a step from the same state, and need its answer only once.
+_answers: dict[bytes, tuple[np.ndarray, np.ndarray, np.ndarray, list[reference.Particles]]] = {}
+
+
+def reference_step(
+    groups: list[reference.Particles], box: reference.Box, dt: float, kick: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[reference.Particles]]:
+    """Return node momentum, mass and velocity, and the particles after the step."""
+    key = b"".join(a.tobytes() for g in groups for a in (g.x, g.v, g.C, g.deformation, np.asarray(g.kept)))
+    key += box.kernel.encode()
+    if key not in _answers:
+        momentum, mass = reference.scatter(groups, box, kick)
+        velocity, before = reference.update_both(momentum, mass, *reference.scatter_kept(groups, box), box, kick)
+        _answers[key] = (momentum, mass, velocity, reference.gather(groups, velocity, box, dt, before, kick))
+    return _answers[key]
+
+
+def check_steps(scene: Scene, arrays: Arrays, tolerance: float) -> None:
+    """Compare the nodes and the particles of every recorded step with the reference."""
+    gravity = np.array(scene.domain.gravity)
+    faces = scene.domain.walls.faces(scene.dimension)
+    box = reference.Box(scene.domain.cells, scene.domain.spacing, gravity, faces, kernel=scene.solver.kernel)
+    laws = sorted({body.material.law for body in scene.bodies})
+    inside = tuple(slice(PAD - reference.MARGIN, PAD + n + 1 + reference.MARGIN) for n in box.cells)
+    for k in range(path_run.RECORDED):
+        groups = reference_groups(scene, arrays, k)
+        # Leapfrog: the first step brings the velocities to its middle, every further one to the next middle.
+        kick = path_run.STEP * (0.5 if k == 0 else 1.0)
+        momentum, mass, velocity, expected = reference_step(groups, box, path_run.STEP, kick)
+        fastest = np.abs(velocity).max()
+        for law, group in zip(laws, expected, strict=True):
+            # C is (4/h) times differences of velocities, so their round-off is its measure.
+            scales = {"x": group.x.max(), "v": fastest, "C": 4 / box.spacing * fastest, "deformation": 1.0}
+            for name, scale in scales.items():
+                error = np.abs(arrays[f"{k + 1}_{law}_{name}"] - getattr(group, name)).max() / scale
+                assert error < tolerance, f"step {k}, {law} {name}: {error:.2e}"
+        nodes = arrays[f"{k}_nodes"][inside]
+        check_nodes(nodes, momentum, mass, velocity, kick * box.gravity, tolerance)

@@ -9,10 +9,11 @@ import sys
 from dataclasses import replace
 
 import numpy as np
+import scenes
+from scenes import body, box, liquid, solid
 
 from mpmcli.errors import InputError
-from mpmcli.materials.registry import parameter_models
-from mpmcli.scene import BodyParticles, Scene, parse_scene, sample_bodies
+from mpmcli.scene import BodyParticles, Scene, sample_bodies
 from mpmcli.solver.engine.run import Run, build_run
 from mpmcli.solver.frames.diagnosis import read_group
 from mpmcli.solver.machine.backend import Backend, start_backend
@@ -32,56 +33,27 @@ def scene_of(dimension: int, precision: str) -> Scene:
     size = [n * SPACING for n in CELLS[d]]
     origin = [-0.35, 0.2, 0.1][:d]
 
-    def box(low: tuple[float, ...], high: tuple[float, ...]) -> dict:
-        return {
-            "box": {
-                "min": [o + s * f for o, s, f in zip(origin, size, low, strict=False)],
-                "max": [o + s * f for o, s, f in zip(origin, size, high, strict=False)],
-            }
-        }
+    def inside(low: tuple[float, ...], high: tuple[float, ...]) -> dict:
+        return box(*([o + s * f for o, s, f in zip(origin, size, end, strict=False)] for end in (low, high)))
 
     # What is remembered of openings has a test of its own (test_volume.py).
-    fluid = {"law": "fluid", "density": 1000.0, "bulk_modulus": 8000.0, "volume_correction": False}
-    per_cell = {"sampling": "jittered", "particles_per_cell": 4 if d == 2 else 3}
-    bodies = [
-        {
-            "name": "jelly",
-            "material": {"law": "neo_hookean", "density": 800.0, "youngs_modulus": 6000.0, "poissons_ratio": 0.3},
-            "shape": box((0.0, 0.0, 0.0), (0.3, 0.45, 0.5)),
-            "velocity": [1.0, -2.0, 1.5][:d],
-            **per_cell,
-        },
-        {
-            "name": "water",
-            "material": fluid,
-            "shape": box((0.65, 0.5, 0.5), (1.0, 1.0, 1.0)),
-            "velocity": [3.0, 1.0, 1.0][:d],
-            **per_cell,
-        },
-        {
-            "name": "oil",
-            # With suction, so that both kinds are stepped.
-            "material": {**fluid, "density": 500.0, "bulk_modulus": 5000.0, "tension_cutoff": False},
-            "shape": box((0.65, 0.1, 0.1), (0.9, 0.4, 0.45)),
-            "velocity": [-3.0, 2.0, -2.0][:d],
-            **per_cell,
-        },
-    ]
-    data = {
-        "domain": {
-            "size": size,
-            "origin": origin,
-            "spacing": SPACING,
-            "gravity": [0.4, -9.81, 1.0][:d],
-            "walls": FACES if d == 2 else FACES_3D,
-        },
-        "time": {"end": 2.4, "frames": 1},
-        "solver": {"precision": precision},
-        "output": {"fields": ["velocity", "volume_ratio", "affine", "deformation_gradient"]},
-        "bodies": bodies,
-        "contact": {"default": "stick"},
-    }
-    return parse_scene(data, laws=parameter_models()).scene
+    fluid, per_cell = liquid(8000.0, volume_correction=False), 4 if d == 2 else 3
+    # With suction, so that both kinds are stepped.
+    oil = fluid | {"density": 500.0, "bulk_modulus": 5000.0, "tension_cutoff": False}
+    places = (
+        ("jelly", solid(6e3, density=800.0, poissons_ratio=0.3), (0.0, 0.0, 0.0), (0.3, 0.45, 0.5), [1.0, -2.0, 1.5]),
+        ("water", fluid, (0.65, 0.5, 0.5), (1.0, 1.0, 1.0), [3.0, 1.0, 1.0]),
+        ("oil", oil, (0.65, 0.1, 0.1), (0.9, 0.4, 0.45), [-3.0, 2.0, -2.0]),
+    )
+    more = {"sampling": "jittered", "particles_per_cell": per_cell}
+    return scenes.scene_of(
+        *(body(name, law, inside(low, high), velocity=v[:d], **more) for name, law, low, high, v in places),
+        domain={"size": size, "origin": origin, "spacing": SPACING, "gravity": [0.4, -9.81, 1.0][:d]},
+        walls=FACES if d == 2 else FACES_3D,
+        end=2.4,
+        precision=precision,
+        fields=["velocity", "volume_ratio", "affine", "deformation_gradient"],
+    )
 
 
 def stirred(scene: Scene) -> list[BodyParticles]:

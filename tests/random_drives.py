@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 import state_run
-from solver_state import scene_of
+from scenes import block, scene_of
 
 from mpmcli.scene import Scene
 
@@ -27,13 +27,14 @@ def random_scene(seed: int, *, driven: bool = True) -> Scene:
     random = np.random.default_rng([14, seed])
     material = LAWS[list(LAWS)[seed % len(LAWS)]]
     low = random.uniform(0.1, 0.4, 2)
-    body: dict[str, Any] = {
-        "name": "block",
-        "material": material,
-        "shape": {"box": {"min": low.tolist(), "max": (low + random.uniform(0.2, 0.45, 2)).tolist()}},
-        "velocity": random.uniform(-2, 2, 2).tolist(),
-        "sampling": ["lattice", "jittered"][int(random.integers(2))],
-    }
+    body: dict[str, Any] = block(
+        "block",
+        material,
+        low.tolist(),
+        (low + random.uniform(0.2, 0.45, 2)).tolist(),
+        velocity=random.uniform(-2, 2, 2).tolist(),
+        sampling=["lattice", "jittered"][int(random.integers(2))],
+    )
     if random.random() < 0.6:
         size = random.uniform(0.02, 0.6)
         if material["law"] == "fluid":
@@ -58,13 +59,9 @@ def random_scene(seed: int, *, driven: bool = True) -> Scene:
     if not driven:
         gravity, forces = [0.0, -9.81], []
     return scene_of(
-        domain={
-            "size": [1.0, 1.0],
-            "cells": [CELLS, CELLS],
-            "gravity": gravity,
-            "walls": ["slip", "separate", "stick"][seed % 3],
-        },
-        time={"end": END, "frames": 1},
-        bodies=[body],
+        body,
+        domain={"size": [1.0, 1.0], "cells": [CELLS, CELLS], "gravity": gravity},
+        walls=["slip", "separate", "stick"][seed % 3],
+        end=END,
         forces=forces,
     )

@@ -22,14 +22,8 @@ FORMS = ("packed", "segments")
 # A drop falls on the floor and splashes, and a jelly ball falls freely; it starts in no time.
 SCENE = """\
 title = "A drop and a ball"
-[domain]
-size = [2.0, 1.0]
-origin = [-0.5, 0.0]
-cells = [32, 16]
-gravity = [0.0, -9.81]
-[time]
-end = 0.2
-frames = 10
+domain = { size = [2.0, 1.0], origin = [-0.5, 0.0], cells = [32, 16], gravity = [0.0, -9.81] }
+time = { end = 0.2, frames = 10 }
 [[bodies]]
 name = "drop"
 material = { law = "fluid", density = 1000.0, bulk_modulus = 1e5 }

@@ -1,48 +1,101 @@
 """Set-ups that tests of whole runs share: scenes in few words, starts of their own, and runs."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from os import PathLike
 
 import numpy as np
-from solver_state import scene_of
+import pytest
 
-from mpmcli.scene import BodyParticles, Scene
+from mpmcli.materials.registry import parameter_models
+from mpmcli.scene import BodyParticles, Scene, parse_scene
 from mpmcli.solver.engine.run import Run
 from mpmcli.solver.frames.builder import FilledCells
 
 GRAVITY = 9.81
+# The table of each key that only one of them has, or `domain` before `contact`.
+TABLES = {
+    key: table
+    for table in ("domain", "time", "output", "solver")
+    for key in Scene.model_fields[table].annotation.model_fields
+}
 
 
-def block(name: str, material: dict, low: Sequence[float], high: Sequence[float], **more: object) -> dict:
+def slow(*values: object, **more: object) -> object:
+    """Return a parameter of a test whose tests with it are slow."""
+    return pytest.param(*values, marks=pytest.mark.slow, **more)
+
+
+def box(low: Iterable, high: Iterable) -> dict:
+    """Return the shape of a box."""
+    return {"box": {"min": list(low), "max": list(high)}}
+
+
+def ball(center: Iterable, radius: float) -> dict:
+    """Return the shape of a ball."""
+    return {"ball": {"center": list(center), "radius": radius}}
+
+
+def plane(point: Iterable, normal: Iterable) -> dict:
+    """Return the shape of a half-space."""
+    return {"plane": {"point": list(point), "normal": list(normal)}}
+
+
+def polygon(vertices: Iterable) -> dict:
+    """Return the shape of a polygon."""
+    return {"polygon": {"vertices": list(vertices)}}
+
+
+def solid(youngs_modulus: float, /, **more: object) -> dict:
+    """Return an elastic material, by default as dense as water."""
+    return {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": youngs_modulus} | more
+
+
+def liquid(bulk_modulus: object, /, **more: object) -> dict:
+    """Return a liquid, by default as dense as water."""
+    return {"law": "fluid", "density": 1000.0, "bulk_modulus": bulk_modulus} | more
+
+
+def body(name: str, material: object, shape: dict, /, **more: object) -> dict:
+    """Return the table of a body."""
+    return {"name": name, "material": material, "shape": shape, **more}
+
+
+def block(name: str, material: object, low: Iterable, high: Iterable, /, **more: object) -> dict:
     """Return the table of a body that is a box."""
-    box = {"min": [float(x) for x in low], "max": [float(x) for x in high]}
-    return {"name": name, "material": material, "shape": {"box": box}, **more}
+    return body(name, material, box(low, high), **more)
 
 
-def scene(
-    cells: Sequence[int],
-    spacing: float,
-    bodies: Sequence[dict],
-    end: float,
-    *,
-    frames: int = 1,
-    gravity: Sequence[float] = (),
-    walls: object = "separate",
-    friction: object = 0.0,
-    precision: str = "f32",
-    fields: Sequence[str] = ("velocity",),
-) -> Scene:
+def collider(name: str, shape: dict, /, **more: object) -> dict:
+    """Return the table of a collider."""
+    return {"name": name, "shape": shape, **more}
+
+
+def tables_of(*bodies: dict, **keys: object) -> dict:
+    """Return the tables of a scene of 1 s and one frame; `spacing` stands for that of `domain`, `end` for `time.end`.
+
+    `cells` with a spacing give the size. Bodies share one velocity field, unless `contact` is given.
+    """
+    tables = {"domain": {}, "time": {"end": 1.0, "frames": 1}, "contact": {"default": "stick"}, "bodies": [*bodies]}
+    for key, value in keys.items():
+        if key in TABLES:
+            tables[TABLES[key]] = tables.get(TABLES[key], {}) | {key: value}
+        else:
+            tables[key] = tables.get(key, {}) | value if key in TABLES.values() else value
+    domain = tables["domain"]
+    if {"cells", "spacing"} <= domain.keys():
+        domain["size"] = [n * domain["spacing"] for n in domain.pop("cells")]
+    return tables
+
+
+def scene_of(*bodies: dict, directory: str | PathLike[str] = ".", **keys: object) -> Scene:
+    """Return the scene of the tables of these words."""
+    return parse_scene(tables_of(*bodies, **keys), laws=parameter_models(), directory=directory).scene
+
+
+def scene(cells: Sequence[int], spacing: float, bodies: Sequence[dict], end: float, **keys: object) -> Scene:
     """Return a scene with a number of cells."""
-    domain = {"size": [n * spacing for n in cells], "spacing": spacing, "walls": walls, "friction": friction}
-    if len(gravity) > 0:
-        domain["gravity"] = [float(g) for g in gravity]
-    return scene_of(
-        domain=domain,
-        time={"end": float(end), "frames": frames},
-        output={"fields": list(fields)},
-        solver={"precision": precision},
-        bodies=list(bodies),
-    )
+    return scene_of(*bodies, **{"cells": cells, "spacing": spacing, "end": end, "fields": ["velocity"]} | keys)
 
 
 def tilted(degrees: float) -> list[float]:
@@ -80,12 +133,7 @@ def restart(run: Run, samples: Sequence[BodyParticles], end: float) -> None:
 
 
 def volume_errors(
-    x: np.ndarray,
-    volume: np.ndarray,
-    flows: np.ndarray,
-    spacing: float,
-    cells: Sequence[int],
-    periodic: Sequence[bool],
+    x: np.ndarray, volume: np.ndarray, flows: np.ndarray, spacing: float, cells: Sequence[int], periodic: Sequence[bool]
 ) -> np.ndarray:
     """Return the volume errors of (T, n, d) places, the particles added in two parts, which change no bit."""
     halves, whole = (FilledCells(x, spacing, cells, periodic) for _ in range(2))

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from pydantic import TypeAdapter
+from scenes import scene_of as scene_of
 
-from mpmcli.materials.registry import parameter_models
-from mpmcli.scene import Scene, parse_scene
+from mpmcli.scene import Scene
 from mpmcli.scene.colliders import Collider
 from mpmcli.solver.engine.run import Run
 from mpmcli.solver.frames.diagnosis import Snapshot, read_group
@@ -39,11 +39,6 @@ class BodyState:
         """sum m (|v|^2 + (h^2/4) |C|^2) / 2."""
         affine = (self.C**2).sum((1, 2)) * h * h / 4
         return float(self.mass @ ((self.v**2).sum(1) + affine) / 2)
-
-
-def scene_of(**tables: object) -> Scene:
-    """Return the scene of these tables; bodies share one velocity field, unless `contact` is given."""
-    return parse_scene({"contact": {"default": "stick"}} | tables, laws=parameter_models()).scene
 
 
 def with_colliders(scene: Scene, colliders: list[dict]) -> Scene:

@@ -3,8 +3,9 @@
 import json
 import sys
 
-from mpmcli.materials.registry import parameter_models
-from mpmcli.scene import Scene, parse_scene
+from scenes import block, box, collider, scene_of
+
+from mpmcli.scene import Scene
 from mpmcli.solver.engine.run import Run, build_run
 from mpmcli.solver.engine.saved_state import SavedState
 from mpmcli.solver.machine.backend import start_backend, stop_backend
@@ -29,20 +30,14 @@ MATERIALS = {
     "von_mises": {"law": "von_mises", **SOFT, "yield_stress": 500.0},
 }
 # It falls into the material, and turns.
-RAFT = {
-    "name": "raft",
-    "density": 500.0,
-    "shape": {"box": {"min": [0.3, 0.45], "max": [0.6, 0.6]}},
-    "velocity": [0.0, -5.0],
-    "angular_velocity": 1.0,
-}
-WHEEL = {
-    "name": "wheel",
-    "mass": 30.0,
-    "shape": {"box": {"min": [0.78, 0.3], "max": [0.86, 0.7]}},
-    "restitution": 0.5,
-    "joint": {"type": "hinge", "point": [0.82, 0.6], "motor": "8 * t", "strength": 60.0},
-}
+RAFT = collider("raft", box([0.3, 0.45], [0.6, 0.6]), density=500.0, velocity=[0.0, -5.0], angular_velocity=1.0)
+WHEEL = collider(
+    "wheel",
+    box([0.78, 0.3], [0.86, 0.7]),
+    mass=30.0,
+    restitution=0.5,
+    joint={"type": "hinge", "point": [0.82, 0.6], "motor": "8 * t", "strength": 60.0},
+)
 # By the name of each scene: the materials of its bodies, its dimension, and further tables.
 SCENES = {name: ((name,), 2, {}) for name in MATERIALS} | {
     "3D": (("fluid",), 3, {}),
@@ -69,27 +64,17 @@ def scene_named(name: str) -> Scene:
     # Bodies that meet where they are begin apart, and fly at each other.
     total = "solids" in more.get("solver", {}) or "contact" in more
     bodies = [
-        {
-            "name": f"body {k}",
-            "material": MATERIALS[material],
-            "shape": {
-                "box": {
-                    "min": [0.1 + width * k, 0.02, 0.3][:d],
-                    "max": [0.1 + width * (k + (0.6 if total else 0.8)), 0.4, 0.6][:d],
-                }
-            },
-            "velocity": [-2.0 if total and k == 1 else 1.0, -2.0, 0.5][:d],
-        }
+        block(
+            f"body {k}",
+            MATERIALS[material],
+            [0.1 + width * k, 0.02, 0.3][:d],
+            [0.1 + width * (k + (0.6 if total else 0.8)), 0.4, 0.6][:d],
+            velocity=[-2.0 if total and k == 1 else 1.0, -2.0, 0.5][:d],
+        )
         for k, material in enumerate(materials)
     ]
-    data = {
-        "domain": {"size": [1.0] * d, "cells": [20 if d == 2 else 12] * d, "gravity": [0.0, -9.81, 0.0][:d]},
-        "time": {"end": 1.0, "frames": 1},
-        "bodies": bodies,
-        "contact": {"default": "stick"},
-        **more,
-    }
-    return parse_scene(data, laws=parameter_models(), source=name).scene
+    domain = {"size": [1.0] * d, "cells": [20 if d == 2 else 12] * d, "gravity": [0.0, -9.81, 0.0][:d]}
+    return scene_of(*bodies, domain=domain, **more)
 
 
 def advance(run: Run, steps: int) -> None:

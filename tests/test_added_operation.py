@@ -5,8 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from added_operation import Marker, fields_with_mark
-from scenes import block
-from solver_state import scene_of
+from scenes import block, scene_of
 from test_batch import batch_of, outputs_of
 
 from mpmcli.scene import Scene
@@ -40,9 +39,9 @@ def added(monkeypatch: pytest.MonkeyPatch) -> None:
 def thrown(speed: float = FAST, *, precision: str = "f64", **solver: object) -> Scene:
     """Return a block of FAR particles that hits a wall and a floor."""
     return scene_of(
+        block("jelly", JELLY, [0.5, 0.12], [0.8, 0.42]) | {"velocity": [speed, -1.0]},
         domain={"size": [1.0, 1.0], "spacing": 0.05, "gravity": [0.0, -9.81]},
-        time={"end": COUNT * STEP, "frames": 1, "step": STEP},
-        bodies=[block("jelly", JELLY, [0.5, 0.12], [0.8, 0.42]) | {"velocity": [speed, -1.0]}],
+        time={"end": COUNT * STEP, "step": STEP},
         solver={"precision": precision} | solver,
     )
 

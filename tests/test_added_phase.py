@@ -6,8 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from added_feature import Drag
-from scenes import block
-from solver_state import scene_of
+from scenes import block, scene_of
 from taichi.lang import kernel_impl
 
 from mpmcli.scene import Scene
@@ -43,10 +42,10 @@ def flying(rate: float = RATE, *, precision: str = "f64", frames: int = 1, **mor
     """Return two bodies that fly apart."""
     places = ("left", [0.3, 0.4], [0.5, 0.6]), ("right", [0.8, 0.4], [1.0, 0.6])
     return scene_of(
+        *(block(name, JELLY, *box) | {"velocity": v} for (name, *box), v in zip(places, STARTS, strict=True)),
         title=f"drag {rate}",
         domain={"size": [1.4, 1.0], "spacing": 0.05, "gravity": [0.0, 0.0]},
         time={"end": 0.1, "frames": frames, "step": STEP},
-        bodies=[block(name, JELLY, *box) | {"velocity": v} for (name, *box), v in zip(places, STARTS, strict=True)],
         solver={"precision": precision} | more.get("solver", {}),
         **{name: table for name, table in more.items() if name != "solver"},
     )

@@ -9,7 +9,10 @@ import mpm_reference as reference
 import numpy as np
 import pytest
 from contact_scenes import DENSITY, LAMBDA, MU, NU, SEPARATE, E, G, H, body, jelly, scene
-from solver_state import bodies_of, scene_of
+from rounding import farthest
+from scenes import ball, block, box, collider, liquid, scene_of, slow
+from solver_state import bodies_of
+from test_batch import batch_of
 
 from mpmcli.errors import InputError
 from mpmcli.frames.frame import Frame
@@ -21,7 +24,7 @@ from mpmcli.solver.contact.surfaces import rest_surface
 from mpmcli.solver.engine.plan import make_plan
 from mpmcli.solver.engine.refusals import require_possible
 from mpmcli.solver.engine.resolved import Resolved
-from mpmcli.solver.engine.run import build_run
+from mpmcli.solver.engine.run import Run, build_run, frames_of_all
 from mpmcli.solver.machine.backend import Backend
 from mpmcli.validation.case import Setting
 from mpmcli.validation.cases.two_disks import SPEED, SeparateDisks
@@ -91,7 +94,7 @@ def test_elastic_bodies_separate_unless_they_meet_nothing_or_the_solver_has_one_
     assert Layers.of(both) == Layers.of(scene([a, b])) and ContactTable(both).between(0, 1)[0] == 0.02
     rough = scene([a, b], contact={"friction": 0.4})
     assert ContactTable(rough).between(0, 1) == (0.4, "contact.friction")
-    raft = {"name": "raft", "density": 500.0, "shape": {"box": {"min": [1.0, 0.5], "max": [1.5, 0.7]}}}
+    raft = {"name": "raft", "density": 500.0, "shape": box([1.0, 0.5], [1.5, 0.7])}
     assert Layers.of(scene([a, b], contact={}, colliders=[raft])).separate
     for reason, tables in (
         ('solver.solids = "total"', {"solver": {"solids": "total"}, "domain": {"walls": "separate"}}),
@@ -182,7 +185,7 @@ def test_what_has_one_velocity_field_is_refused(tables: dict, arch: str, reason:
 # The exchange at nodes.
 
 
-@pytest.mark.parametrize("dimension", [2, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("dimension", [2, slow(3)])
 def test_a_step_is_that_of_plain_numpy(backend_of: Callable, dimension: int) -> None:
     """One step of two bodies that move and are deformed at random, between a rough floor and a ball that moves.
 
@@ -201,13 +204,13 @@ def test_a_step_is_that_of_plain_numpy(backend_of: Callable, dimension: int) -> 
             "friction": {"y_min": 0.2},
         },
         colliders=[
-            {
-                "name": "ball",
-                "shape": {"ball": {"center": centre, "radius": 1.5 * H}},
-                "velocity": pace,
-                "angular_velocity": spin,
-                "friction": 0.4,
-            }
+            collider(
+                "ball",
+                {"ball": {"center": centre, "radius": 1.5 * H}},
+                velocity=pace,
+                angular_velocity=spin,
+                friction=0.4,
+            )
         ],
     )
     run = build_run(both, backend_of("f64", 1))
@@ -309,10 +312,7 @@ def falls_below(level: float, time: np.ndarray, values: np.ndarray) -> float:
 
 @pytest.mark.parametrize(
     ("shift", "n", "off", "lost"),
-    [
-        (0.3, 16, 0.03, 0.06),
-        *(pytest.param(*figures, marks=pytest.mark.slow) for figures in ((0.0, 16, 0.03, 0.06), (0.3, 32, 0.03, 0.04))),
-    ],
+    [(0.3, 16, 0.03, 0.06), *(slow(*figures) for figures in ((0.0, 16, 0.03, 0.06), (0.3, 32, 0.03, 0.04)))],
 )
 def test_bars_meet_where_their_ends_are(backend_of: Callable, shift: float, n: int, off: float, lost: float) -> None:
     """They touch within 0.03 cells of their ends, stay for 2 L / c, and part at nearly the speed of approach."""
@@ -333,12 +333,12 @@ def test_bars_meet_where_their_ends_are(backend_of: Callable, shift: float, n: i
 @pytest.mark.slow
 def test_stress_is_uniform_up_to_a_surface_in_contact(backend_of: Callable) -> None:
     """A block between a floor and a lid that presses it by 2 %: layers of particles within 0.11 of the mean."""
-    lid = {"name": "lid", "shape": {"box": {"min": [4 * H, 18.3 * H], "max": [28 * H, 24 * H]}}}
+    lid = {"name": "lid", "shape": box([4 * H, 18.3 * H], [28 * H, 24 * H])}
     press = lid | {"offset": ["0", f"{-0.32 * H!r} * clamp(t / 1.0, 0, 1)"]}
     material = jelly(poissons_ratio=0.0)
     tables = {"domain": {"size": [32 * H, 28 * H], "gravity": [0.0, 0.0]}, "colliders": [press]}
     block = body("block", [8, 2.3], [24, 18.3], material=material)
-    floor = {"name": "floor", "shape": {"box": {"min": [4 * H, -2 * H], "max": [28 * H, 2.3 * H]}}}
+    floor = {"name": "floor", "shape": box([4 * H, -2 * H], [28 * H, 2.3 * H])}
     asked = scene([block], end=2.0, frames=40, **tables | {"colliders": [press, floor]})
     asked = asked.model_copy(update={"output": asked.output.model_copy(update={"fields": ("stress",)})})
     late = [frame for frame, _ in build_run(asked, backend_of("f64", 1)).frames()][20:]
@@ -374,10 +374,7 @@ def slides(run: object) -> tuple[np.ndarray, np.ndarray]:
     return tuple(np.array(frames).T)
 
 
-@pytest.mark.parametrize(
-    ("friction", "shift"),
-    [(0.3, 0.3), (0.0, 0.3), *(pytest.param(0.3, shift, marks=pytest.mark.slow) for shift in (0.0, 0.5))],
-)
+@pytest.mark.parametrize(("friction", "shift"), [(0.3, 0.3), (0.0, 0.3), *(slow(0.3, shift) for shift in (0.0, 0.5))])
 def test_a_block_slides_with_the_friction_that_was_asked_for(
     backend_of: Callable, friction: float, shift: float
 ) -> None:
@@ -403,7 +400,7 @@ def test_a_disc_rolls_or_slides_down_an_elastic_slope(backend_of: Callable) -> N
     """On 20 degrees: 2/3 g sin where it rolls; with mu = 0.05 it slides with g (sin - mu cos), and spins by mu."""
     slope, y, r = math.radians(20), 6.3, 8
     along, down = f"{G * math.sin(slope)!r}*clamp((t-0.3)*1e6,0,1)", f"{-G * math.cos(slope)!r}*clamp(t/0.18,0,1)"
-    shape = {"ball": {"center": [18.3 * H, (y + r) * H], "radius": r * H}}
+    shape = ball([18.3 * H, (y + r) * H], r * H)
     base = body("base", [6, 0], [66, y], material=jelly(youngs_modulus=4e6))
     disc = {"name": "disc", "shape": shape, "material": jelly(youngs_modulus=4e6)}
     for friction in (0.5, 0.05):
@@ -446,11 +443,7 @@ def test_cubes_that_touch_anywhere_are_left_alone(backend_of: Callable) -> None:
         body("b", [4.11, 7.44, 11.41], [9.55, 13.11, 15.97]),
     )
     touch = scene_of(
-        domain={"size": [20 * H] * 3, "spacing": H, "gravity": [0.0] * 3},
-        time={"end": 0.005, "frames": 1},
-        bodies=[low, high],
-        contact=SEPARATE,
-        solver={"precision": "f64"},
+        low, high, size=[20 * H] * 3, spacing=H, gravity=[0.0] * 3, end=0.005, contact=SEPARATE, precision="f64"
     )
     frame, row = list(build_run(touch, backend_of("f64", 1)).frames())[-1]
     assert np.abs(frame.velocity).max() < 5e-4 * math.sqrt((LAMBDA + 2 * MU) / DENSITY)
@@ -467,11 +460,7 @@ def test_single_precision_bears_nodes_of_hardly_any_mass(backend_of: Callable) -
 
 
 def thrown(
-    mirrored: bool = False,
-    turned: bool = False,
-    names: str = "abc",
-    safety: float = 0.8,
-    contact: dict | None = None,
+    mirrored: bool = False, turned: bool = False, names: str = "abc", safety: float = 0.8, contact: dict | None = None
 ) -> Scene:
     """Boxes that meet in the air at a third of their wave speed; `turned`: in another order."""
 
@@ -586,7 +575,7 @@ def discs(shift: Sequence[float], precision: str) -> Scene:
     ("arch", "precision", "shift", "error"),
     [
         ("cpu", "f64", (32, 16), 1e-8),
-        pytest.param("cpu", "f64", (32, 16, 5), 1e-8, marks=pytest.mark.slow),
+        slow("cpu", "f64", (32, 16, 5), 1e-8),
         pytest.param("vulkan", "f32", (32, 16), 1e-4, marks=[pytest.mark.slow, pytest.mark.gpu]),
     ],
 )
@@ -668,3 +657,65 @@ def test_metal_carries_its_surface_along(backend_of: Callable) -> None:
     assert angle == pytest.approx(1.0, abs=0.02)
     assert found[:, :2] == pytest.approx(at_rest[:, :2] @ turn.T, abs=0.02)
     assert found[:, 2] == pytest.approx(at_rest[:, 2], rel=0.02)
+
+
+def pushed(dimension: int, friction: float = 0.3, **tables) -> Scene:
+    """Return two blocks of jelly that fly at each other above a floor, one of them beside water and against a ball."""
+    d = dimension
+    # In 3D they have the same depth everywhere.
+    bodies = [
+        ("left", jelly(), [0.2, 0.02, 0.3], [0.45, 0.3, 0.6], 2.0),
+        ("right", jelly(youngs_modulus=2e5), [0.48, 0.02, 0.3], [0.7, 0.3, 0.6], -2.0),
+        *[("water", liquid(1e5), [0.72, 0.02], [0.9, 0.2], -1.0)] * (d == 2),
+    ]
+    return scene_of(
+        *(
+            block(name, material, low[:d], high[:d], velocity=[speed, -2.0, 0.0][:d])
+            for name, material, low, high, speed in bodies
+        ),
+        domain={"size": [1.0] * d, "cells": [20 if d == 2 else 14] * d, "gravity": [0.0, -9.81, 0.0][:d]},
+        friction=0.2,
+        time={"end": 0.02, "frames": 2},
+        colliders=[collider("ball", ball([0.1, 0.15, 0.45][:d], 0.08), velocity=[5.0, 0.0, 0.0][:d], friction=0.4)],
+        contact={"default": "separate", "friction": friction},
+        precision="f32",
+        **tables,
+    )
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("dimension", [2, slow(3)])
+def test_contact_on_a_gpu_follows_that_on_the_cpu(backend_of: Callable, dimension: int) -> None:
+    """Positions to round-off, forces and overlaps to 1e-3, across a saved state; a frame forgets what it has told."""
+    found, steps = [], 100 if dimension == 2 else 50
+    for arch in ("vulkan", "cpu"):
+        run = build_run(pushed(dimension), backend_of("f32", 1, arch))
+        for k in range(steps):
+            run.step(2e-4)
+            if k == steps // 2 and arch == "vulkan":
+                run.load(run.save().copied())
+        frame, row = run.frame()
+        told = np.array([*row.contact_force, *row.collider_force])
+        assert np.abs(run.frame()[1].contact_force).max() == 0.0
+        found.append((frame, told, row.contact_overlap))
+    (own, told, overlap), (other, expected_told, expected_overlap) = found
+    apart = farthest(other.position, other.velocity, steps, other.time)
+    assert np.abs(own.position - other.position).max() < apart
+    assert (np.abs(expected_told[[-2, -1], 0]) > 5).all()
+    assert np.abs(told - expected_told).max() < 1e-3 * np.abs(expected_told).max()
+    assert overlap == pytest.approx(expected_overlap, rel=1e-3)
+
+
+@pytest.mark.gpu
+@pytest.mark.slow
+def test_runs_of_a_batch_do_what_they_do_alone(backend_of: Callable) -> None:
+    """Each with friction of its own."""
+    scenes = [pushed(2), pushed(2, friction=0.0)]
+    backend = backend_of("f32", 1, "vulkan")
+    batch, last = batch_of(scenes, backend), {}
+    for slot, event in frames_of_all({k: Run(batch, k, one) for k, one in enumerate(scenes)}):
+        if isinstance(event, tuple):
+            last[slot] = event[0].position
+    *_, (alone, _) = build_run(scenes[1], backend).frames()
+    assert np.abs(last[0] - last[1]).max() > 1e-4
+    assert np.abs(last[1] - alone.position).max() < 1e-5

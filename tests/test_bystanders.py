@@ -1,7 +1,7 @@
 """Moduli that are "auto" follow what can reach a body, and nothing that only stands in its scene."""
 
 import pytest
-from solver_state import scene_of
+from scenes import block, box, scene_of
 
 METAL = {"law": "neo_hookean", "density": 8000.0, "youngs_modulus": 1e9}
 WATER = {"law": "fluid", "density": 1000.0}
@@ -10,15 +10,11 @@ WATER = {"law": "fluid", "density": 1000.0}
 def modulus(*others: dict, gravity: tuple[float, float] = (0.0, -9.81), law: str = "sand", **scene: object) -> float:
     """Return the modulus of a column beside others, of metal unless they say of what."""
     own = {"law": "sand", "density": 1500.0, "friction_angle": 30.0} if law == "sand" else WATER
-    bodies = [{"name": "column", "material": own, "shape": box([0.0, 0.0], [0.4, 0.4])}]
+    bodies = [block("column", own, [0.0, 0.0], [0.4, 0.4])]
     bodies += [{"name": f"other{i}", "material": METAL} | other for i, other in enumerate(others)]
     domain = {"size": [2.0, 2.0], "spacing": 0.05, "gravity": list(gravity)}
-    material = scene_of(domain=domain, time={"end": 1.0, "frames": 2}, bodies=bodies, **scene).bodies[0].material
+    material = scene_of(*bodies, domain=domain, frames=2, **scene).bodies[0].material
     return material.youngs_modulus if law == "sand" else material.bulk_modulus
-
-
-def box(low: list[float], high: list[float]) -> dict:
-    return {"box": {"min": low, "max": high}}
 
 
 STANDING = {"shape": box([1.0, 0.0], [1.2, 1.0])}

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 import pytest
-from solver_state import scene_of
+from scenes import block, scene_of, slow
 
 from mpmcli.frames.frame import Frame
 from mpmcli.solver.engine.run import build_run
@@ -42,17 +42,12 @@ def reference(reynolds: float, n: int = 64) -> np.ndarray:
 def cavity(reynolds: float, n: int, end: float, velocity: Mapping[str, list[float]], walls: object = "stick"):
     """Return the scene of a box of n cells along each axis, full of liquid."""
     d = len(next(iter(velocity.values())))
+    material = {"law": "fluid", "density": DENSITY, "viscosity": DENSITY * SPEED / reynolds}
     return scene_of(
+        block("liquid", material, [0.0] * d, [1.0] * d),
         domain={"size": [1.0] * d, "spacing": 1 / n, "walls": walls, "wall_velocity": velocity},
         time={"end": end, "frames": round(8 * end)},
-        bodies=[
-            {
-                "name": "liquid",
-                "material": {"law": "fluid", "density": DENSITY, "viscosity": DENSITY * SPEED / reynolds},
-                "shape": {"box": {"min": [0.0] * d, "max": [1.0] * d}},
-            }
-        ],
-        output={"fields": ["velocity", "volume_ratio"]},
+        fields=["velocity", "volume_ratio"],
     )
 
 
@@ -70,12 +65,7 @@ def profile(frames: list[Frame], n: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("reynolds", "n", "end", "bound"),
-    [
-        (10.0, 16, 4.0, 0.5),
-        pytest.param(100.0, 32, 15.0, 1.5, marks=pytest.mark.slow),
-        pytest.param(100.0, 64, 15.0, 1.5, marks=pytest.mark.slow),
-    ],
+    ("reynolds", "n", "end", "bound"), [(10.0, 16, 4.0, 0.5), slow(100.0, 32, 15.0, 1.5), slow(100.0, 64, 15.0, 1.5)]
 )
 def test_a_lid_drives_the_flow_below(
     backend_of: Callable, record_property: Callable, reynolds: float, n: int, end: float, bound: float
@@ -92,18 +82,15 @@ def test_a_lid_drives_the_flow_below(
     assert least > UNCRUSHED
 
 
-@pytest.mark.parametrize(
-    ("velocity", "walls"),
-    [
-        pytest.param({"y_max": [SPEED, 0.0], "y_min": [-SPEED, 0.0]}, "stick", id="opposite"),
-        pytest.param({"y_max": [SPEED, 0.0], "x_max": [0.0, SPEED]}, "stick", id="meet"),
-        pytest.param({"x_min": [0.0, SPEED]}, {"default": "slip", "x_min": "stick"}, id="slip"),
-        pytest.param({"y_max": [SPEED, 0.0, 0.7 * SPEED]}, "stick", id="3D"),
-        pytest.param(
-            {"y_max": [SPEED, 0.0, 0.0]}, {"default": "stick", "z_min": "periodic", "z_max": "periodic"}, id="periodic"
-        ),
-    ],
-)
+@pytest.mark.parametrize(("velocity", "walls"), [
+    pytest.param({"y_max": [SPEED, 0.0], "y_min": [-SPEED, 0.0]}, "stick", id="opposite"),
+    pytest.param({"y_max": [SPEED, 0.0], "x_max": [0.0, SPEED]}, "stick", id="meet"),
+    pytest.param({"x_min": [0.0, SPEED]}, {"default": "slip", "x_min": "stick"}, id="slip"),
+    pytest.param({"y_max": [SPEED, 0.0, 0.7 * SPEED]}, "stick", id="3D"),
+    pytest.param(
+        {"y_max": [SPEED, 0.0, 0.0]}, {"default": "stick", "z_min": "periodic", "z_max": "periodic"}, id="periodic"
+    ),
+])  # fmt: skip
 @pytest.mark.slow
 def test_nothing_is_crushed_in_a_corner(
     backend_of: Callable, record_property: Callable, velocity: Mapping[str, list[float]], walls: object
@@ -115,7 +102,7 @@ def test_nothing_is_crushed_in_a_corner(
     assert least > UNCRUSHED
 
 
-@pytest.mark.parametrize("d", [2, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("d", [2, slow(3)])
 def test_a_lid_drives_nothing_through_other_walls(backend_of: Callable, d: int) -> None:
     """The normal velocity on a wall is zero, up to and in the corners."""
     n = 8

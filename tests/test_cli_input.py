@@ -50,25 +50,19 @@ SCENES = {
         'scene.toml:11: bodies[0].material.densty: unknown key; did you mean "density"?',
     ),
     "wrong type": (("end = 0.05", 'end = "0.05"'), 'scene.toml:7: time.end: must be a number; found "0.05"'),
-    "negative density": (
-        ("density = 1000.0", "density = -1000.0"),
-        "scene.toml:11: bodies[0].material.density: must be greater than 0; found -1000.0",
-    ),
+    "negative density": (("density = 1000.0", "density = -1000.0"),
+        "scene.toml:11: bodies[0].material.density: must be greater than 0; found -1000.0"),
     "zero frames": (("frames = 4", "frames = 0"), "scene.toml:8: time.frames: must be at least 1; found 0"),
-    "body outside": (
-        ("max = [0.75, 0.5]", "max = [0.75, 1.5]"),
+    "body outside": (("max = [0.75, 0.5]", "max = [0.75, 1.5]"),
         'scene.toml:12: bodies[0].shape: body "drop" leaves the domain through y_max by 0.5 m '
-        "(it reaches y = 1.5, the face is at 1); move it or enlarge the domain",
-    ),
-    "1D": (
-        ("size = [1.0, 1.0]", "size = [1.0]"),
-        "scene.toml:3: domain.size: needs two numbers (2D) or three (3D); found 1",
-    ),
+        "(it reaches y = 1.5, the face is at 1); move it or enlarge the domain"),
+    "1D": (("size = [1.0, 1.0]", "size = [1.0]"),
+        "scene.toml:3: domain.size: needs two numbers (2D) or three (3D); found 1"),
     "TOML syntax": (
         ("cells = [16, 16]", "cells = [16, 16"),
         "scene.toml:5:1: not valid TOML: a list is not closed with ]",
     ),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("fault", SCENES)
@@ -124,26 +118,20 @@ def test_a_backend_that_is_not_there_is_refused(refused, monkeypatch):
     assert said == "--arch cuda needs a device that this machine does not have; use --arch cpu."
 
 
-@pytest.mark.parametrize(
-    ("arguments", "sentence"),
-    [
-        (["simulat"], 'there is no command "simulat"; did you mean "simulate"? See mpmcli --help.'),
-        (
-            ["paint"],
-            'there is no command "paint"; the commands are new, check, simulate, materials, info, ',
-        ),
-        (["--verbose"], "no such option '--verbose'"),
-        (["simulate"], "missing argument 'SCENE'. See mpmcli simulate --help."),
-        (["simulate", "a.toml", "b.toml"], "got unexpected extra argument (b.toml). See mpmcli simulate --help."),
-        (["simulate", "nothing.toml"], "nothing.toml: there is no such file"),
-        (["simulate", "."], ".: this is a directory; did you mean scene.toml?"),
-        (["info", "nothing.toml"], "nothing.toml: there is no such file"),
-        (["info", "nothing"], "nothing does not exist"),
-        (["info", "."], ". holds no result of mpmcli"),
-        (["completion", "tcsh"], "invalid value"),
-        (["bench", "--case", "4d-1"], 'there is no case "4d-1"; the cases are 2d-64, '),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "sentence"), [
+    (["simulat"], 'there is no command "simulat"; did you mean "simulate"? See mpmcli --help.'),
+    (["paint"], 'there is no command "paint"; the commands are new, check, simulate, materials, info, '),
+    (["--verbose"], "no such option '--verbose'"),
+    (["simulate"], "missing argument 'SCENE'. See mpmcli simulate --help."),
+    (["simulate", "a.toml", "b.toml"], "got unexpected extra argument (b.toml). See mpmcli simulate --help."),
+    (["simulate", "nothing.toml"], "nothing.toml: there is no such file"),
+    (["simulate", "."], ".: this is a directory; did you mean scene.toml?"),
+    (["info", "nothing.toml"], "nothing.toml: there is no such file"),
+    (["info", "nothing"], "nothing does not exist"),
+    (["info", "."], ". holds no result of mpmcli"),
+    (["completion", "tcsh"], "invalid value"),
+    (["bench", "--case", "4d-1"], 'there is no case "4d-1"; the cases are 2d-64, '),
+])  # fmt: skip
 def test_a_bad_command_is_refused_with_one_sentence(refused, arguments, sentence):
     assert refused(*arguments).startswith(sentence)
 

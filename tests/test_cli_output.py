@@ -90,12 +90,7 @@ def test_few_particles_run_on_one_thread_with_the_same_bytes(results, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("path", "kind"),
-    [
-        ("packed", "packed"),
-        ("packed/particles.vtkhdf", "packed"),
-        ("series/particles.pvd", "packed"),
-    ],
+    ("path", "kind"), [("packed", "packed"), ("packed/particles.vtkhdf", "packed"), ("series/particles.pvd", "packed")]
 )
 def test_info_says_what_a_result_holds(run, path, kind):
     facts = json.loads(run("info", path, "--json").stdout)

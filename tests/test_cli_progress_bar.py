@@ -30,12 +30,6 @@ def test_lines_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
     ]
 
 
-def test_a_line_now_and_then_only(capsys: pytest.CaptureFixture[str]) -> None:
-    with ProgressBar(12, "frames", quiet=False, pause=1e9) as bar:
-        bar.show(3)
-    assert capsys.readouterr().err == ""
-
-
 def test_a_bar_on_a_terminal(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FORCE_COLOR", "1")  # rich takes the stream for a terminal
     monkeypatch.setenv("TERM", "xterm")
@@ -49,7 +43,11 @@ def test_a_bar_on_a_terminal(capsys: pytest.CaptureFixture[str], monkeypatch: py
     assert "2 s left" not in drawn  # the bar has its own
 
 
-def test_quiet_is_quiet(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_quiet_is_quiet_and_lines_come_now_and_then_only(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with ProgressBar(12, "frames", quiet=False, pause=1e9) as bar:
+        bar.show(3)
     monkeypatch.setenv("FORCE_COLOR", "1")
     with ProgressBar(12, "frames", quiet=True, pause=0.0) as bar:
         bar.show(3)

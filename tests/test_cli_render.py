@@ -70,12 +70,8 @@ def test_a_picture_of_the_last_frame_lies_beside_the_result(run: Path) -> None:
 
 
 SCENE_WITH_ALL = """\
-[domain]
-size = [1.0, 0.6]
-spacing = 0.02
-[time]
-end = 1.0
-frames = 2
+domain = { size = [1.0, 0.6], spacing = 0.02 }
+time = { end = 1.0, frames = 2 }
 [[bodies]]
 name = "block"
 material = "jelly"
@@ -138,12 +134,8 @@ def test_a_scene_is_drawn_as_it_starts(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 TURNING = """
-[domain]
-size = [1.0, 0.6, 0.5]
-spacing = 0.05
-[time]
-end = 0.1
-frames = 1
+domain = { size = [1.0, 0.6, 0.5], spacing = 0.05 }
+time = { end = 0.1, frames = 1 }
 [[bodies]]
 name = "drop"
 material = "water"
@@ -170,12 +162,8 @@ def test_what_turns_has_an_arrow_at_its_rim(tmp_path: Path) -> None:
 
 
 LOADED = """
-[domain]
-size = [1.0, 0.6]
-spacing = 0.05
-[time]
-end = 2.0
-frames = 1
+domain = { size = [1.0, 0.6], spacing = 0.05 }
+time = { end = 2.0, frames = 1 }
 [[bodies]]
 name = "bar"
 material = "jelly"

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from command import run_here
 from drawn_results import WATER, frame, header, row
-from solver_state import scene_of
+from scenes import ball, body, box, scene_of
 from test_plot import drawn
 
 from mpmcli.check.collider_work import unsure_work, work_of_colliders
@@ -19,8 +19,8 @@ from mpmcli.output import SegmentStore
 from mpmcli.scene.colliders import Collider
 from mpmcli.solver.engine.run import build_run
 
-POST = {"name": "post", "shape": {"ball": {"center": [0.5, 0.1], "radius": 0.1}}}
-ROD = {"name": "rod", "shape": {"box": {"min": [0.1, 0.1], "max": [0.2, 0.2]}}, "velocity": [0.1, 0.0]}
+POST = {"name": "post", "shape": ball([0.5, 0.1], 0.1)}
+ROD = {"name": "rod", "shape": box([0.1, 0.1], [0.2, 0.2]), "velocity": [0.1, 0.0]}
 MASS, G, PAUSE, STEP = 2.0, 9.81, 0.01, 1e-3
 # On the post and on the rod, N/m, since the frame before.
 FORCES = np.array([[[0.0, 0.0], [0.0, 0.0]], [[1.0, -3.0], [0.5, 0.0]], [[2.0, -5.0], [0.0, 1.0]]])
@@ -48,19 +48,13 @@ def written(
         taken = PAUSE * FORCES[: k + 1, : len(colliders)].sum(axis=(0, 1))
         fallen = MASS * G * max(time - STEP / 2, 0.0)
         numbers = {
-            "steps": 10 * bool(k),
-            "step_min": STEP * bool(k),
-            "step_max": STEP * bool(k),
-            "speed_max": 1.0,
-            "courant_max": 1e-2,
-            "volume_ratio_min": 1.0,
-            "volume_ratio_max": 1.0,
-            "mass": MASS,
+            "steps": 10 * bool(k), "step_min": STEP * bool(k), "step_max": STEP * bool(k), "speed_max": 1.0,
+            "courant_max": 1e-2, "volume_ratio_min": 1.0, "volume_ratio_max": 1.0, "mass": MASS,
             "kinetic": 0.5 + gain * k - 0.1 * PAUSE * FORCES[: k + 1, 1, 0].sum(),
             "linear_momentum": (-taken[0], -fallen - taken[1]),
             "collider_force": tuple(map(tuple, FORCES[k, : len(colliders)].tolist())),
             "collider_torque": ((0.0,),) * len(colliders),
-        }
+        }  # fmt: skip
         store.write(entry, replace(row(time, 2), **(numbers | changes)))
     store.finish()
     return directory
@@ -105,7 +99,7 @@ def test_the_work_of_a_collider_is_the_integral_of_its_power(dimension: int) -> 
     d, turns = dimension, 2 * dimension - 3
     motion = {"velocity": ["cos(3*t)", "2*t", "0*t"][:d], "angular_velocity": "sin(5*t)"}
     motion |= {"axis": [2.0, 2.0, 1.0]} if d == 3 else {}
-    shape = {"ball": {"center": [0.5] * d, "radius": 0.1}}
+    shape = ball([0.5] * d, 0.1)
     collider = Collider.model_validate({"name": "one", "shape": shape} | motion, context={"dimension": d})
 
     def gone(t: np.ndarray) -> np.ndarray:
@@ -131,7 +125,7 @@ def test_the_work_of_a_collider_is_the_integral_of_its_power(dimension: int) -> 
 def test_work_is_unsure_where_a_collider_starts_abruptly() -> None:
     """At constant acceleration against a load that grows from zero with time: no energy from nothing is found there."""
     motion = {"velocity": ["3*clamp(t-0.2,0,9)", "0*t"]}
-    shape = {"ball": {"center": [0.5, 0.5], "radius": 0.1}}
+    shape = ball([0.5, 0.5], 0.1)
     collider = Collider.model_validate({"name": "one", "shape": shape} | motion, context={"dimension": 2})
     t = np.linspace(0.0, 1.0, 51)
     moves = np.maximum(t - 0.2, 0.0)
@@ -153,16 +147,16 @@ def test_work_is_summed_by_step(backend_of: Callable, dimension: int) -> None:
     """A collider that starts at 0.3 of a frame holds a body and turns: its work is m v^2/2 and what turns, to first
     order in the step. From means over frames it is wrong by a seventh in the first frame."""
     d, h = dimension, 0.1
-    shape = {"box": {"min": [0.8] * d, "max": [1.4] * d}}
+    shape = box([0.8] * d, [1.4] * d)
     material = {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 1e5, "poissons_ratio": 0.3}
     start = "clamp((t - 0.013) / 0.02, 0, 1)"
     holder = {"name": "holder", "wall": "hold", "velocity": [f"0.5 * {start}"] + ["0 * t"] * (d - 1)}
     holder |= {"angular_velocity": f"2 * {start}", "pivot": [1.0] * d} | ({"axis": [1.0, 2.0, 2.0]} if d == 3 else {})
     scene = scene_of(
+        body("body", material, shape),
         domain={"size": [2.4] * d, "spacing": h, "gravity": [0.0] * d},
         time={"end": 0.04, "frames": 4, "step": 1e-4},
-        bodies=[{"name": "body", "material": material, "shape": shape}],
-        colliders=[holder | {"shape": {"box": {"min": [0.4] * d, "max": [1.8] * d}}}],
+        colliders=[holder | {"shape": box([0.4] * d, [1.8] * d)}],
     )
     rows = [row for _, row in build_run(scene, backend_of("f32", 1)).frames()]
     kinetic, works = np.array([row.kinetic for row in rows]), np.array([row.collider_work for row in rows])

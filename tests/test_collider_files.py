@@ -18,11 +18,7 @@ from mpmcli.scene.colliders import Collider
 
 BALL = {"name": "ball", "shape": {"ball": {"center": [0.3, 0.5, 0.5], "radius": 0.1}}, "velocity": [2.0, 0.0, 0.0]}
 GROUND = {"name": "ground", "shape": {"plane": {"point": [0.5, 0.5, 0.1], "normal": [0.0, 0.0, 1.0]}}}
-PADDLE = {
-    "name": "paddle",
-    "shape": {"box": {"min": [0.2, 0.2], "max": [0.4, 0.3]}},
-    "angular_velocity": 100.0,
-}
+PADDLE = {"name": "paddle", "shape": {"box": {"min": [0.2, 0.2], "max": [0.4, 0.3]}}, "angular_velocity": 100.0}
 POST = {"name": "post", "shape": {"ball": {"center": [0.7, 0.5], "radius": 0.1}}}
 
 

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from solver_state import scene_of
+from scenes import block, body, box, plane, polygon, scene_of
 
 from mpmcli.scene import Scene
 from mpmcli.solver.engine.run import build_run
@@ -28,35 +28,28 @@ def falling(
     The top of the plate is `offset` cells above a node.
     """
     across, z = [(24 if dimension == 2 else 8) * H] * (dimension - 1), (8 + offset) * H
-    body = {"min": [0.0] * (dimension - 1) + [z + 3 * H], "max": [*across, z + (3 + rows) * H]}
-    plate = {"min": [-H] * (dimension - 1) + [z - thickness * H], "max": [x + H for x in across] + [z]}
+    own = block("body", material, [0.0] * (dimension - 1) + [z + 3 * H], [*across, z + (3 + rows) * H])
+    plate = box([-H] * (dimension - 1) + [z - thickness * H], [x + H for x in across] + [z])
     return scene_of(
-        domain={
-            "size": [*across, (20 + rows) * H],
-            "spacing": H,
-            "gravity": [0.0] * (dimension - 1) + [-G],
-            "walls": {"default": "slip", ("y_max", "z_max")[dimension - 2]: "separate"},
-        },
+        own,
+        domain={"size": [*across, (20 + rows) * H], "spacing": H, "gravity": [0.0] * (dimension - 1) + [-G]},
+        walls={"default": "slip", ("y_max", "z_max")[dimension - 2]: "separate"},
         time={"end": 4.0, "frames": 80},
-        solver={"kernel": kernel},
-        bodies=[{"name": "body", "material": material, "shape": {"box": body}}],
-        colliders=[{"name": "plate", "shape": {"box": plate}}],
+        kernel=kernel,
+        colliders=[{"name": "plate", "shape": plate}],
     ), z
 
 
-@pytest.mark.parametrize(
-    ("material", "offset", "options"),
-    [
-        (WATER, 0.0, {}),
-        (WATER, 0.3, {}),
-        (WATER, 0.5, {}),
-        (SAND, 0.0, {}),
-        (SAND, 0.4, {}),
-        pytest.param(WATER, 0.25, {"dimension": 3}, marks=pytest.mark.slow),
-        pytest.param(SAND, 0.25, {"dimension": 3}, marks=pytest.mark.slow),
-        pytest.param(WATER, 0.25, {"kernel": "cubic"}, marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.parametrize(("material", "offset", "options"), [
+    (WATER, 0.0, {}),
+    (WATER, 0.3, {}),
+    (WATER, 0.5, {}),
+    (SAND, 0.0, {}),
+    (SAND, 0.4, {}),
+    pytest.param(WATER, 0.25, {"dimension": 3}, marks=pytest.mark.slow),
+    pytest.param(SAND, 0.25, {"dimension": 3}, marks=pytest.mark.slow),
+    pytest.param(WATER, 0.25, {"kernel": "cubic"}, marks=pytest.mark.slow),
+])  # fmt: skip
 def test_what_falls_lies_where_the_surface_is(
     backend_of: Callable, material: dict, offset: float, options: dict
 ) -> None:
@@ -81,18 +74,10 @@ def test_what_falls_lies_where_the_surface_is(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("material", "offset", "most"),
-    # 0.25, 0.30, 0.48 midway between nodes, 0.24; sand 0.25, 0.30.
-    [
-        (WATER, 0.0, 0.32),
-        (WATER, 0.25, 0.32),
-        (WATER, 0.5, 0.52),
-        (WATER, 0.75, 0.32),
-        (SAND, 0.0, 0.32),
-        (SAND, 0.25, 0.32),
-    ],
-)
+@pytest.mark.parametrize(("material", "offset", "most"), [
+    (WATER, 0.0, 0.32), (WATER, 0.25, 0.32), (WATER, 0.5, 0.52), (WATER, 0.75, 0.32), (SAND, 0.0, 0.32),
+    (SAND, 0.25, 0.32),
+])  # fmt: skip
 def test_what_falls_meets_the_surface(
     backend_of: Callable, material: dict, offset: float, most: float, record_property: Callable
 ) -> None:
@@ -120,13 +105,10 @@ def test_points_that_do_not_act_are_counted_in_their_step(backend_of: Callable) 
     z = middle[1] + (12 * np.tan(slope) + 3) * H
     planes = {"floor": (middle, normal), "left": ([4 * H, 0], [1, 0]), "right": ([28 * H, 0], [-1, 0])}
     asked = scene_of(
+        block("body", WATER, [5 * H, z], [27 * H, z + 6 * H]),
         domain={"size": [32 * H, 24 * H], "spacing": H, "gravity": [0.0, -G], "walls": {"default": "slip"}},
         time={"end": 0.24, "frames": 12, "safety": 0.25},
-        bodies=[{"name": "body", "material": WATER, "shape": {"box": {"min": [5 * H, z], "max": [27 * H, z + 6 * H]}}}],
-        colliders=[
-            {"name": name, "shape": {"plane": {"point": list(map(float, y)), "normal": list(map(float, n))}}}
-            for name, (y, n) in planes.items()
-        ],
+        colliders=[{"name": name, "shape": plane(map(float, y), map(float, n))} for name, (y, n) in planes.items()],
     )
     frames = [frame for frame, _ in build_run(asked, backend_of("f32", 1)).frames()]
     assert min(((frame.position - middle) @ normal).min() for frame in frames) > 0
@@ -141,15 +123,11 @@ def test_a_sheet_of_water_flies_past_an_edge(backend_of: Callable, thickness: fl
     face, top, speed = 8.15 * H, (8 + above) * H, 5.0
     sheet = {"min": [face, 2 * H], "max": [face + thickness * H, 6 * H]}
     asked = scene_of(
-        domain={
-            "size": [20 * H, 20 * H],
-            "spacing": H,
-            "gravity": [0.0, 0.0],
-            "walls": {"default": "slip", "y_max": "separate"},
-        },
+        body("sheet", WATER, {"box": sheet}, velocity=[0.0, speed]),
+        domain={"size": [20 * H, 20 * H], "spacing": H, "gravity": [0.0, 0.0]},
+        walls={"default": "slip", "y_max": "separate"},
         time={"end": 0.12, "frames": 3},
-        bodies=[{"name": "sheet", "material": WATER, "velocity": [0.0, speed], "shape": {"box": sheet}}],
-        colliders=[{"name": "post", "shape": {"box": {"min": [4 * H, -H], "max": [face, top]}}}],
+        colliders=[{"name": "post", "shape": box([4 * H, -H], [face, top])}],
     )
     for frame, _ in build_run(asked, backend_of("f32", 1)).frames():
         assert frame.velocity == pytest.approx(np.tile([0.0, speed], (len(frame.velocity), 1)), abs=1e-3)
@@ -166,15 +144,11 @@ def test_no_spray_enters_a_slope_beside_a_wall(backend_of: Callable, degrees: fl
     middle, normal = np.array([16.3 * H, 6.3 * H]), np.array([-np.sin(slope), np.cos(slope)])
     low = [11.3 * H, middle[1] + (4 * np.tan(slope) + 3) * H]
     asked = scene_of(
-        domain={
-            "size": [24 * H, 22 * H],
-            "spacing": H,
-            "gravity": [0.0, -G],
-            "walls": {"default": "slip", "y_max": "separate"},
-        },
+        block("body", WATER, low, [y + 9 * H for y in low]),
+        domain={"size": [24 * H, 22 * H], "spacing": H, "gravity": [0.0, -G]},
+        walls={"default": "slip", "y_max": "separate"},
         time={"end": 0.6, "frames": 60},
-        bodies=[{"name": "body", "material": WATER, "shape": {"box": {"min": low, "max": [y + 9 * H for y in low]}}}],
-        colliders=[{"name": "slope", "shape": {"plane": {"point": middle.tolist(), "normal": normal.tolist()}}}],
+        colliders=[{"name": "slope", "shape": plane(middle.tolist(), normal.tolist())}],
     )
     frames = [frame for frame, _ in build_run(asked, backend_of("f32", 1)).frames()]
     assert min(((frame.position - middle) @ normal).min() for frame in frames) > -0.2 * H
@@ -189,21 +163,19 @@ def vessel(
     """
     low, high = np.array([6.0, 4.0]) + offset, np.array([18.0, 24.0]) + offset
     outside, inside, filled = (
-        {"box": {"min": list((low - wall) * H), "max": [(high[0] + wall) * H, top * H]}}
+        box((low - wall) * H, [(high[0] + wall) * H, top * H])
         for wall, top in ((thickness, high[1]), (0, high[1] + 1), (0, low[1] + 10))
     )
     shape = outside | {"subtract": [inside]}
     if outline:
         (x, y), (right, top) = (low - thickness) * H, high * H + [thickness * H, 0.0]
         (a, b), c = low * H, high[0] * H
-        shape = {
-            "polygon": {"vertices": [[x, y], [right, y], [right, top], [c, top], [c, b], [a, b], [a, top], [x, top]]}
-        }
+        shape = polygon([[x, y], [right, y], [right, top], [c, top], [c, b], [a, b], [a, top], [x, top]])
     return (
         scene_of(
+            body("water", WATER, filled, sampling="turned") | water,
             domain={"size": [24 * H, 28 * H], "spacing": H, "gravity": [0.0, -G], "walls": "open"},
             time={"end": end, "frames": 20},
-            bodies=[{"name": "water", "material": WATER, "shape": filled, "sampling": "turned", **water}],
             colliders=[{"name": "vessel", "shape": shape}],
         ),
         low * H,
@@ -211,21 +183,18 @@ def vessel(
     )
 
 
-@pytest.mark.parametrize(
-    ("thickness", "offset", "share"),
-    [
-        (2, 0.0, 0.0),
-        # One particle of 480 was at 0.31 cells.
-        (2, 0.3, 0.0025),
-        pytest.param(1, 0.0, 0.005, marks=pytest.mark.slow),
-        # A wall of one cell between nodes leaks: 0.146 here, and 0.45 at 0.5.
-        pytest.param(1, 0.3, 0.2, marks=pytest.mark.slow),
-        # Two particles of 480 were at 0.33 cells.
-        pytest.param(2.5, 0.0, 0.005, marks=pytest.mark.slow),
-        pytest.param(3, 0.0, 0.0, marks=pytest.mark.slow),
-        pytest.param(4, 0.0, 0.0, marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.parametrize(("thickness", "offset", "share"), [
+    (2, 0.0, 0.0),
+    # One particle of 480 was at 0.31 cells.
+    (2, 0.3, 0.0025),
+    pytest.param(1, 0.0, 0.005, marks=pytest.mark.slow),
+    # A wall of one cell between nodes leaks: 0.146 here, and 0.45 at 0.5.
+    pytest.param(1, 0.3, 0.2, marks=pytest.mark.slow),
+    # Two particles of 480 were at 0.33 cells.
+    pytest.param(2.5, 0.0, 0.005, marks=pytest.mark.slow),
+    pytest.param(3, 0.0, 0.0, marks=pytest.mark.slow),
+    pytest.param(4, 0.0, 0.0, marks=pytest.mark.slow),
+])  # fmt: skip
 def test_a_vessel_with_thin_walls_holds_water(
     backend_of: Callable, thickness: float, offset: float, share: float, record_property: Callable
 ) -> None:
@@ -284,24 +253,14 @@ def test_couette_flow_ends_at_a_surface_that_sticks(
     """The profile between it and a wall that moves is 0 at the surface, to 0.12 cells (0.27 off at nodes)."""
     z, speed, top = (8 + offset) * H, 1.0, 24 * H
     rate = speed / (top - z)
+    motion = {"velocity": [speed / 2, 0.0], "velocity_gradient": [[0.0, rate], [0.0, 0.0]]}
     asked = scene_of(
-        domain={
-            "size": [8 * H, top],
-            "spacing": H,
-            "walls": {"default": "periodic", "y_min": "stick", "y_max": "stick"},
-            "wall_velocity": {"y_max": [speed, 0.0]},
-        },
+        block("body", WATER | {"viscosity": 100.0}, [0.0, z], [8 * H, top], **motion),
+        domain={"size": [8 * H, top], "spacing": H},
+        walls={"default": "periodic", "y_min": "stick", "y_max": "stick"},
+        wall_velocity={"y_max": [speed, 0.0]},
         time={"end": 1.5, "frames": 15},
-        bodies=[
-            {
-                "name": "body",
-                "material": WATER | {"viscosity": 100.0},
-                "shape": {"box": {"min": [0.0, z], "max": [8 * H, top]}},
-                "velocity": [speed / 2, 0.0],
-                "velocity_gradient": [[0.0, rate], [0.0, 0.0]],
-            }
-        ],
-        colliders=[{"name": "plate", "shape": {"plane": {"point": [0.0, z], "normal": [0.0, 1.0]}}, "wall": "stick"}],
+        colliders=[{"name": "plate", "shape": plane([0.0, z], [0.0, 1.0]), "wall": "stick"}],
     )
     places = []
     for frame, _ in list(build_run(asked, backend_of("f32", 1)).frames())[8:]:
@@ -317,12 +276,12 @@ def test_couette_flow_ends_at_a_surface_that_sticks(
 def test_a_jet_presses_with_its_momentum(backend_of: Callable, record_property: Callable) -> None:
     """A jet of 8 cells on a plate with free ends: rho U^2 b, to 2 %."""
     speed, width = 2.0, 8 * H
-    mouth = {"box": {"min": [28 * H, 28 * H], "max": [36 * H, 30 * H]}}
+    mouth = box([28 * H, 28 * H], [36 * H, 30 * H])
     asked = scene_of(
         domain={"size": [64 * H, 36 * H], "spacing": H, "walls": "open"},
         time={"end": 2.0, "frames": 40},
-        emitters=[{"name": "jet", "material": WATER, "shape": mouth, "velocity": [0.0, -speed]}],
-        colliders=[{"name": "plate", "shape": {"box": {"min": [12 * H, 4 * H], "max": [52 * H, 8 * H]}}}],
+        emitters=[body("jet", WATER, mouth, velocity=[0.0, -speed])],
+        colliders=[{"name": "plate", "shape": box([12 * H, 4 * H], [52 * H, 8 * H])}],
     )
     force = [row.collider_force[0][1] for frame, row in build_run(asked, backend_of("f32", 1)).frames() if row.time > 1]
     share = -np.mean(force) / (1000 * speed**2 * width)
@@ -342,12 +301,11 @@ def test_sand_runs_out_of_a_hopper(backend_of: Callable, cells: int, record_prop
     slot, x = 0.06, np.array([[0.28, 0.6], [0.3, 0.6], [0.3, 0.42], [0.37, 0.35], [0.37, 0.32], [0.28, 0.4]])
     sides = {"left": x, "right": [0.8, 0.0] + [-1.0, 1.0] * x}
     asked = scene_of(
+        block("sand", "sand", [0.3, 0.42], [0.5, 0.56]),
         domain={"size": [0.8, 0.6], "spacing": slot / cells, "gravity": [0.0, -G], "friction": 0.6},
         time={"end": 0.6, "frames": 60},
-        bodies=[{"name": "sand", "material": "sand", "shape": {"box": {"min": [0.3, 0.42], "max": [0.5, 0.56]}}}],
         colliders=[
-            {"name": name, "shape": {"polygon": {"vertices": np.asarray(y).tolist()}}, "friction": 0.4}
-            for name, y in sides.items()
+            {"name": name, "shape": polygon(np.asarray(y).tolist()), "friction": 0.4} for name, y in sides.items()
         ],
     )
     frames = list(build_run(asked, backend_of("f32", 1)).frames())
@@ -360,11 +318,11 @@ def test_sand_runs_out_of_a_hopper(backend_of: Callable, cells: int, record_prop
 
 def dam(wall: float, face: float | None) -> Scene:
     """Return water of 12 x 24 cells at the left wall, and the other wall or, `face` cells from the left, a pillar."""
-    pillar = {"box": {"min": [(face or 0.0) * H, -2 * H], "max": [((face or 0.0) + 10) * H, 90 * H]}}
+    pillar = box([(face or 0.0) * H, -2 * H], [((face or 0.0) + 10) * H, 90 * H])
     return scene_of(
+        block("body", WATER, [0.0, 0.0], [12 * H, 24 * H]),
         domain={"size": [wall * H, 88 * H], "spacing": H, "gravity": [0.0, -G], "walls": "separate"},
         time={"end": 2.0, "frames": 80},
-        bodies=[{"name": "body", "material": WATER, "shape": {"box": {"min": [0.0, 0.0], "max": [12 * H, 24 * H]}}}],
         colliders=[] if face is None else [{"name": "pillar", "shape": pillar}],
     )
 
@@ -412,20 +370,10 @@ def test_sand_slumps_beside_a_collider_as_beside_a_wall(
     for face in (8 + offset, 0.0):
         plane = {"plane": {"point": [face * H, 0.0], "normal": [1.0, 0.0]}}
         asked = scene_of(
-            domain={
-                "size": [60 * H, 20 * H],
-                "spacing": H,
-                "gravity": [0.0, -G],
-                "friction": {"x_min": 0.5, "y_min": 0.5},
-            },
+            block("body", SAND | {"youngs_modulus": 3e6}, [face * H, 0.0], [(face + 12) * H, 12 * H]),
+            domain={"size": [60 * H, 20 * H], "spacing": H, "gravity": [0.0, -G]},
+            friction={"x_min": 0.5, "y_min": 0.5},
             time={"end": 2.0, "frames": 10},
-            bodies=[
-                {
-                    "name": "body",
-                    "material": SAND | {"youngs_modulus": 3e6},
-                    "shape": {"box": {"min": [face * H, 0.0], "max": [(face + 12) * H, 12 * H]}},
-                }
-            ],
             colliders=[{"name": "face", "shape": plane, "friction": 0.5}] if face else [],
         )
         *_, (last, _) = build_run(asked, backend_of("f32", 1)).frames()

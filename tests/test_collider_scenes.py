@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from solver_state import scene_of
+from scenes import ball, block, body, plane, polygon, scene_of
 from test_colliders import run
 
 from mpmcli.api import load_scene
@@ -41,9 +41,8 @@ def test_a_mesh_at_rest_is_sampled_in_the_domain_alone(tmp_path: Path) -> None:
     found = []
     for velocity in ([0.0, 0.0, 0.0], [0.0, 0.0, 0.1]):
         scene = scene_of(
+            block("w", "water", [0.4] * 3, [0.6] * 3),
             domain={"size": [1.0] * 3, "spacing": h},
-            time={"end": 1.0, "frames": 1},
-            bodies=[{"name": "w", "material": "water", "shape": {"box": {"min": [0.4] * 3, "max": [0.6] * 3}}}],
             colliders=[{"name": "c", "shape": {"mesh": {"file": ground}}, "velocity": velocity}],
         )
         (part,) = parts_of(scene.colliders[0], scene.domain)
@@ -66,9 +65,9 @@ def test_water_in_a_mesh_rests_as_in_a_box(backend_of: Callable, tmp_path: Path,
     def rest(colliders: list[dict], size: float, corner: float) -> tuple[float, float]:
         body = {"name": "w", "shape": {"box": {"min": [corner] * 3, "max": [corner + 0.6, corner + 0.6, corner + 0.3]}}}
         scene = scene_of(
+            body | water,
             domain={"size": [size] * 3, "spacing": h, "gravity": [0.0, 0.0, -G], "walls": "separate"},
             time={"end": 0.6, "frames": 6},
-            bodies=[body | water],
             colliders=colliders,
         )
         frames = run(scene, backend)
@@ -99,9 +98,9 @@ def test_a_ball_rolls_down_a_mesh(backend_of: Callable, tmp_path: Path, record_p
     center = [float(place[0]), 0.32, float(place[1])]
     jelly = {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 4e5, "poissons_ratio": 0.3}
     scene = scene_of(
+        body("ball", jelly, ball(center, radius)),
         domain={"size": [1.6, 0.64, 1.2], "spacing": h, "gravity": [0.0, 0.0, -G]},
         time={"end": 0.6, "frames": 12},
-        bodies=[{"name": "ball", "material": jelly, "shape": {"ball": {"center": center, "radius": radius}}}],
         colliders=[{"name": "ramp", "shape": {"mesh": {"file": ramp}}, "friction": 0.8}],
     )
     frames = run(scene, backend_of("f32"))
@@ -124,12 +123,10 @@ def sand_on(degrees: float) -> tuple[Scene, np.ndarray]:
     corners = [corner, corner + 0.5 * down, corner + 0.44 * down + 0.1 * normal, corner + 0.06 * down + 0.1 * normal]
     sand = {"law": "sand", "density": 1600.0, "youngs_modulus": 5e5, "poissons_ratio": 0.3, "friction_angle": 30.0}
     scene = scene_of(
+        body("s", sand, polygon([list(c) for c in corners])),
         domain={"size": [1.4, 1.4], "spacing": h, "gravity": [0.0, -G]},
         time={"end": 0.6, "frames": 6},
-        bodies=[{"name": "s", "material": sand, "shape": {"polygon": {"vertices": [list(c) for c in corners]}}}],
-        colliders=[
-            {"name": "p", "shape": {"plane": {"point": list(start), "normal": list(normal)}}, "wall": "stick"},
-        ],
+        colliders=[{"name": "p", "shape": plane(start, normal), "wall": "stick"}],
     )
     return scene, down
 

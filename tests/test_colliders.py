@@ -1,13 +1,16 @@
 """Colliders in the solver: distances, what a step takes, slopes, weight, buoyancy, and nothing that passes them."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import taichi as ti
-from solver_state import bodies_of, scene_of, with_colliders
+from rounding import farthest
+from scenes import ball, block, body, box, collider, plane, polygon, scene_of
+from solver_state import bodies_of, with_colliders
+from test_batch import scene_named
 
 from mpmcli.boundaries.colliders import BLEND, BLEND_NEAR, ColliderKind, ColliderMotion, Colliders, corners_of
 from mpmcli.boundaries.loads import Loads
@@ -21,22 +24,22 @@ from mpmcli.solver.engine.run import build_run
 G = 10.0
 JELLY = {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 1e6, "poissons_ratio": 0.3}
 SHAPES_2D = [
-    {"plane": {"point": [0.3, 0.4], "normal": [1.0, 2.0]}},
-    {"box": {"min": [0.3, 0.4], "max": [0.6, 0.5]}},
-    {"ball": {"center": [0.5, 0.4], "radius": 0.2}},
+    plane([0.3, 0.4], [1.0, 2.0]),
+    box([0.3, 0.4], [0.6, 0.5]),
+    ball([0.5, 0.4], 0.2),
     {"capsule": {"start": [0.3, 0.3], "end": [0.5, 0.6], "radius": 0.1}},
-    {"polygon": {"vertices": [[0.2, 0.2], [0.8, 0.3], [0.5, 0.4], [0.4, 0.8]]}},
-    {"polygon": {"vertices": [[0.4, 0.8], [0.5, 0.4], [0.8, 0.3], [0.2, 0.2]]}},
-    {"ball": {"center": [0.5, 0.5], "radius": 0.4}, "subtract": [{"ball": {"center": [0.5, 0.5], "radius": 0.2}}]},
+    polygon([[0.2, 0.2], [0.8, 0.3], [0.5, 0.4], [0.4, 0.8]]),
+    polygon([[0.4, 0.8], [0.5, 0.4], [0.8, 0.3], [0.2, 0.2]]),
+    {"ball": {"center": [0.5, 0.5], "radius": 0.4}, "subtract": [ball([0.5, 0.5], 0.2)]},
 ]
 SHAPES_3D = [
-    {"plane": {"point": [0.3, 0.4, 0.5], "normal": [1.0, 2.0, -1.0]}},
-    {"box": {"min": [0.3, 0.4, 0.2], "max": [0.6, 0.5, 0.7]}},
-    {"ball": {"center": [0.5, 0.4, 0.6], "radius": 0.2}},
+    plane([0.3, 0.4, 0.5], [1.0, 2.0, -1.0]),
+    box([0.3, 0.4, 0.2], [0.6, 0.5, 0.7]),
+    ball([0.5, 0.4, 0.6], 0.2),
     {"capsule": {"start": [0.3, 0.3, 0.3], "end": [0.5, 0.6, 0.7], "radius": 0.1}},
     {"cylinder": {"base": [0.4, 0.4, 0.4], "axis": [1.0, 1.0, 0.3], "radius": 0.15, "height": 0.3}},
     {"box": {"min": [0.3, 0.4, 0.2], "max": [0.6, 0.5, 0.7]}, "rotation": {"axis": [1.0, 2.0, 0.5], "angle": 25.0}},
-    {"ball": {"center": [0.5] * 3, "radius": 0.4}, "subtract": [{"ball": {"center": [0.5] * 3, "radius": 0.2}}]},
+    {"ball": {"center": [0.5] * 3, "radius": 0.4}, "subtract": [ball([0.5] * 3, 0.2)]},
 ]
 
 
@@ -73,12 +76,8 @@ def measured(
     colliders: list[dict], dimension: int, points: np.ndarray, normals: int = 1
 ) -> tuple[tuple[Collider, ...], np.ndarray]:
     """Return colliders, and as kernels find them their distances and normals at points, see `evaluate`; cells of H."""
-    corner = {"box": {"min": [0.9] * dimension, "max": [0.95] * dimension}}
-    scene = scene_of(
-        domain={"size": [1.0] * dimension, "origin": [0.0] * dimension, "spacing": H},
-        time={"end": 1.0, "frames": 1},
-        bodies=[{"name": "b", "material": "jelly", "shape": corner}],
-    )
+    corner = box([0.9] * dimension, [0.95] * dimension)
+    scene = scene_of(body("b", "jelly", corner), size=[1.0] * dimension, origin=[0.0] * dimension, spacing=H)
     scene = with_colliders(scene, [{"name": f"c{k}"} | collider for k, collider in enumerate(colliders)])
     device = Colliders(ColliderKind.of(scene), dimension, (27,) * dimension, 3, 1, on_cpu=True)
     device.spacing = H
@@ -98,11 +97,11 @@ def test_distances_are_those_of_the_shapes(backend_of: Callable, dimension: int)
     points = np.random.default_rng(0).uniform(0.02, 0.98, (400, dimension))
     made, found = measured(colliders, dimension, points)
     step = 1e-6
-    for k, collider in enumerate(made):
-        expected = collider.signed_distance(points)
+    for k, one in enumerate(made):
+        expected = one.signed_distance(points)
         around = np.stack(
             [
-                (collider.signed_distance(points + step * e) - collider.signed_distance(points - step * e)) / (2 * step)
+                (one.signed_distance(points + step * e) - one.signed_distance(points - step * e)) / (2 * step)
                 for e in np.eye(dimension)
             ],
             axis=1,
@@ -112,7 +111,7 @@ def test_distances_are_those_of_the_shapes(backend_of: Callable, dimension: int)
         assert smooth.sum() > 300
         # In the corners of a polygon that is not convex they are those of both edges.
         exact = np.abs(found[:, k, 0] - expected) < 1e-12
-        assert exact.all() or (corners_of(collider)[0] and exact.mean() > 0.99)
+        assert exact.all() or (corners_of(one)[0] and exact.mean() > 0.99)
         assert np.abs(found[:, k, 0] - expected).max() <= BLEND / 8 * H
         assert np.abs(found[smooth & exact, k, 1:] - around[smooth & exact]).max() < 1e-4
 
@@ -142,25 +141,17 @@ def test_normals_turn_around_a_corner(backend_of: Callable, dimension: int) -> N
             assert (normal[:, :2] > -1e-9).all()
 
 
-def box(low: Sequence[float], high: Sequence[float]) -> dict:
-    return {"box": {"min": list(low), "max": list(high)}}
-
-
-def ball(radius: float, center: Sequence[float]) -> dict:
-    return {"ball": {"center": list(center), "radius": radius}}
-
-
 def composites(d: int) -> list[dict]:
     """Return forms added and subtracted, one in another, with faces that overlap, meet and end together."""
     wide, across = [0.5] * d, [0.3] * (d - 2)
     bar = {"capsule": {"start": [0.1, 0.5, *across], "end": [0.9, 0.6, *across], "radius": 0.15}}
     lower = box([0.0, 0.0, *across], [1.0, 0.5, *([0.7] * (d - 2))])
-    ring = ball(0.4, wide) | {"subtract": [ball(0.2, wide)]}
-    half = ball(0.4, wide) | {"subtract": [ball(0.2, wide), box([0.0, 0.5, *[0.0] * (d - 2)], [1.0] * d)]}
+    ring = ball(wide, 0.4) | {"subtract": [ball(wide, 0.2)]}
+    half = ball(wide, 0.4) | {"subtract": [ball(wide, 0.2), box([0.0, 0.5, *[0.0] * (d - 2)], [1.0] * d)]}
     legs = [box([x, 0.5, *across], [x + 0.2, 0.9, *[0.7] * (d - 2)]) for x in (0.1, 0.7)]
     return [
-        box([0.2] * d, [0.7] * d) | {"add": [ball(0.2, [0.7] * d)]},
-        box([0.1] * d, [0.6] * d) | {"subtract": [ball(0.3, [0.6] * d)]},
+        box([0.2] * d, [0.7] * d) | {"add": [ball([0.7] * d, 0.2)]},
+        box([0.1] * d, [0.6] * d) | {"subtract": [ball([0.6] * d, 0.3)]},
         # An arch: two legs that meet half a ring.
         legs[0] | {"add": [legs[1], half]},
         # A cup: the hole ends with the box.
@@ -168,7 +159,7 @@ def composites(d: int) -> list[dict]:
         # Boxes that form one, and a plate with a bar taken away that has a ring of its own.
         box([0.2] * d, [0.5, *[0.7] * (d - 1)]) | {"add": [box([0.5, *[0.2] * (d - 1)], [0.8, *[0.7] * (d - 1)])]},
         lower | {"subtract": [bar | {"add": [ring]}]},
-        ring | {"add": [bar | {"subtract": [ball(0.1, wide)]}]},
+        ring | {"add": [bar | {"subtract": [ball(wide, 0.1)]}]},
     ]
 
 
@@ -189,8 +180,8 @@ def test_composites_have_the_distances_of_their_surface(backend_of: Callable, di
         [{"shape": shape, "side": side} for shape in shapes for side in ("outside", "inside")], dimension, points
     )
     tight = 1e-3 * H
-    for k, collider in enumerate(made):
-        form, sign = collider.form, -1.0 if collider.side == "inside" else 1.0
+    for k, one in enumerate(made):
+        form, sign = one.form, -1.0 if one.side == "inside" else 1.0
         phi, normal = sign * found[:, k, 0], sign * found[:, k, 1:]
         assert ((phi < 0) == form.contains(points))[np.abs(phi) > BLEND / 8 * H].all()
         some = np.flatnonzero(np.abs(phi) < 1.2 * H)
@@ -223,7 +214,7 @@ def test_composites_have_the_distances_of_their_surface(backend_of: Callable, di
 def test_a_composite_of_many_forms_is_sampled(backend_of: Callable) -> None:
     """A row of 70 balls: to 0.05 h within a cell of the surface, where two of them do not meet."""
     backend_of("f64", 1)
-    row = [ball(0.1, [0.1 + 0.01 * k, 0.5]) for k in range(70)]
+    row = [ball([0.1 + 0.01 * k, 0.5], 0.1) for k in range(70)]
     points = np.random.default_rng(4).uniform([0.15, 0.3], [0.75, 0.7], (1000, 2))
     (made,), found = measured([{"shape": {**row[0], "add": row[1:]}}], 2, points)
     expected = made.signed_distance(points)
@@ -273,27 +264,14 @@ def block_on_plane(
         [f"{int(i == j)} - {normal[i] * normal[j] * 1000 * G / 1e6} * ({height} - s)" for j in (0, 1)] for i in (0, 1)
     ]
     place = f"({normal[0]}*(X - {corner[0]}) + {normal[1]}*(Y - {corner[1]}))"
-    weight = {"deformation": [[entry.replace("s)", f"{place})") for entry in row] for row in strain]}
+    weight = {"deformation": [[entry.replace("s)", f"{place})") for entry in row] for row in strain]} if speed else {}
+    material = JELLY | ({"poissons_ratio": 0.0} if speed else {})
     scene = scene_of(
+        body("block", material, polygon([list(c) for c in corners]), velocity=list(speed * down), **weight),
         domain={"size": [64 * h, 48 * h], "spacing": h, "gravity": [f"{x}{slowly}" for x in pull]},
         time={"end": end, "frames": 40},
-        solver={"precision": "f64"},
-        bodies=[
-            {
-                "name": "block",
-                "material": JELLY | ({"poissons_ratio": 0.0} if speed else {}),
-                "shape": {"polygon": {"vertices": [list(c) for c in corners]}},
-                "velocity": list(speed * down),
-                **(weight if speed else {}),
-            }
-        ],
-        colliders=[
-            {
-                "name": "slope",
-                "shape": {"plane": {"point": list(point), "normal": list(normal)}},
-                "friction": friction,
-            }
-        ],
+        precision="f64",
+        colliders=[{"name": "slope", "shape": plane(point, normal), "friction": friction}],
     )
     return scene, down, normal
 
@@ -366,26 +344,15 @@ def test_momentum_goes_to_the_colliders(backend_of: Callable) -> None:
     """Momentum and angular momentum of the particles and what colliders took are constant, to round-off in f64."""
     centers = np.array([[1.0, 0.6], [1.35, 0.95]])
     scene = scene_of(
+        block("b", JELLY, [0.8, 0.9], [1.2, 1.2], velocity=[1.0, -1.0]),
         domain={"size": [2.0, 2.0], "spacing": 0.05},
         time={"end": 0.5, "frames": 5},
-        solver={"precision": "f64"},
-        bodies=[
-            {
-                "name": "b",
-                "material": JELLY,
-                "velocity": [1.0, -1.0],
-                "shape": {"box": {"min": [0.8, 0.9], "max": [1.2, 1.2]}},
-            }
-        ],
+        precision="f64",
         colliders=[
-            {"name": "ball", "shape": {"ball": {"center": list(centers[0]), "radius": 0.25}}, "friction": 0.3},
-            {
-                "name": "paddle",
-                "shape": {"box": {"min": [1.3, 0.6], "max": [1.4, 1.3]}},
-                "angular_velocity": "2 + 0*t",
-                "velocity": ["0*t", 0.0],
-                "wall": "stick",
-            },
+            {"name": "ball", "shape": ball(centers[0], 0.25), "friction": 0.3},
+            collider(
+                "paddle", box([1.3, 0.6], [1.4, 1.3]), angular_velocity="2 + 0*t", velocity=["0*t", 0.0], wall="stick"
+            ),
         ],
     )
     rows = [row for _, row in run(scene, backend_of("f64", 1))]
@@ -403,16 +370,16 @@ def test_momentum_goes_to_the_colliders(backend_of: Callable) -> None:
 def still_water(n: int, colliders: list[dict], shape: dict, *, side: str = "slip") -> Scene:
     """Return water in the state of its own weight, in a box of n cells."""
     return scene_of(
+        body("water", "water", shape, initial_pressure="hydrostatic"),
         domain={"size": [1.0, 1.0], "cells": [n, n], "gravity": [0.0, -9.81], "walls": side},
-        time={"end": 1.0, "frames": 20},
-        bodies=[{"name": "water", "material": "water", "initial_pressure": "hydrostatic", "shape": shape}],
+        frames=20,
         colliders=colliders,
     )
 
 
 def floor_at(height: float) -> dict:
     """Return a floor across the domain."""
-    return {"name": "floor", "shape": {"plane": {"point": [0.0, height], "normal": [0.0, 1.0]}}}
+    return {"name": "floor", "shape": plane([0.0, height], [0.0, 1.0])}
 
 
 @pytest.mark.parametrize("offset", [0.0, pytest.param(0.3, marks=pytest.mark.slow)])
@@ -420,8 +387,8 @@ def test_a_floor_carries_the_weight(backend_of: Callable, offset: float, record_
     """The force on a plane under water at rest, to 1 %."""
     low = (8 + offset) / 32
     # The slab and its motion, which is none, are those of the tank below: both share a kernel.
-    slab = {"name": "slab", "shape": {"box": {"min": [0.4, 0.8], "max": [0.6, 0.9]}}, "velocity": ["0*t", 0.0]}
-    scene = still_water(32, [floor_at(low), slab], {"box": {"min": [0.0, low], "max": [1.0, low + 0.25]}})
+    slab = {"name": "slab", "shape": box([0.4, 0.8], [0.6, 0.9]), "velocity": ["0*t", 0.0]}
+    scene = still_water(32, [floor_at(low), slab], box([0.0, low], [1.0, low + 0.25]))
     rows = [row for _, row in run(scene, backend_of("f32", 1))]
     force = np.mean([row.collider_force[0] for row in rows[10:]], axis=0)
     weight = rows[0].mass * 9.81
@@ -436,7 +403,7 @@ def test_archimedes(backend_of: Callable, offset: float, record_property: Callab
     """Water at rest lifts a fixed disk of 10 cells with the weight of what it displaces, to 2 %."""
     n, radius = 64, 0.16
     center = [0.5 + offset / n, 0.3 + offset / n]
-    disk = {"ball": {"center": center, "radius": radius}}
+    disk = ball(center, radius)
     shape = {"box": {"min": [0.0, 0.0], "max": [1.0, 0.6]}, "subtract": [disk]}
     rows = [row for _, row in run(still_water(n, [{"name": "disk", "shape": disk}], shape), backend_of("f32", 1))]
     force = np.mean([row.collider_force[0] for row in rows[5:]], axis=0)
@@ -449,17 +416,13 @@ def test_archimedes(backend_of: Callable, offset: float, record_property: Callab
 def test_nothing_passes_a_collider_that_moves(backend_of: Callable, speed: float) -> None:
     """A slab sweeps a tank: all water stays before it, whatever its speed; steps are at most half a cell of it."""
     h = 1 / 32
-    slab = {
-        "name": "slab",
-        "shape": {"box": {"min": [0.0, -0.5], "max": [0.15, 2.0]}},
-        "velocity": [f"{speed} if t < {0.6 / speed} else 0", 0.0],
-    }
+    slab = collider("slab", box([0.0, -0.5], [0.15, 2.0]), velocity=[f"{speed} if t < {0.6 / speed} else 0", 0.0])
     end, low = 0.65 / speed, 2 * h
-    water = {"box": {"min": [0.15 + h, low], "max": [0.5, low + 0.3]}}
+    water = box([0.15 + h, low], [0.5, low + 0.3])
     scene = scene_of(
+        body("w", "water", water),
         domain={"size": [1.0, 1.0], "spacing": h, "gravity": [0.0, -9.81], "walls": "slip"},
         time={"end": end, "frames": 6},
-        bodies=[{"name": "w", "material": "water", "shape": water}],
         colliders=[floor_at(low), slab],
     )
     frames = run(scene, backend_of("f32", 1))
@@ -472,20 +435,16 @@ def test_nothing_passes_a_collider_that_moves(backend_of: Callable, speed: float
 
 def test_a_collider_at_speed_limits_the_step(backend_of: Callable) -> None:
     """Half a cell of the fastest point of a blade at most, though nothing is near it; the ledger says what binds."""
-    blade = {
-        "name": "blade",
-        "shape": {"box": {"min": [0.5, 0.7], "max": [0.9, 0.75]}},
-        "angular_velocity": "60 + 0*t",
-        "velocity": ["0*t", 0.0],
-        "pivot": [0.5, 0.7],
-    }
+    blade = collider(
+        "blade", box([0.5, 0.7], [0.9, 0.75]), angular_velocity="60 + 0*t", velocity=["0*t", 0.0], pivot=[0.5, 0.7]
+    )
     # With the ball the kernel is that of the scene above.
     ball = {"name": "ball", "shape": {"ball": {"center": [1.5, 1.5], "radius": 0.2}}}
     scene = scene_of(
+        block("b", JELLY, [0.1, 0.1], [0.2, 0.2]),
         domain={"size": [2.0, 2.0], "spacing": 0.05},
-        time={"end": 0.002, "frames": 1},
-        solver={"precision": "f64"},
-        bodies=[{"name": "b", "material": JELLY, "shape": {"box": {"min": [0.1, 0.1], "max": [0.2, 0.2]}}}],
+        end=0.002,
+        precision="f64",
         colliders=[ball, blade],
     )
     solver = build_run(scene, backend_of("f64", 1))
@@ -505,12 +464,9 @@ def test_turning_colliders_are_where_their_motion_says(backend_of: Callable, dim
     ball = {"ball": {"center": [1.0] * d, "radius": 2.6 * h}}
     held = {"name": "c", "shape": {"ball": {"center": [1.0] * d, "radius": 5 * h}}, "wall": "hold"} | turn
     # In 2D, with the post, the kernel is that of the scenes above.
-    post = {"name": "post", "shape": {"box": {"min": [0.0] * d, "max": [0.1] * d}}}
+    post = {"name": "post", "shape": box([0.0] * d, [0.1] * d)}
     scene = scene_of(
-        domain={"size": [4.0] * d if d == 2 else [2.0] * d, "spacing": h},
-        time={"end": 0.5, "frames": 1},
-        solver={"precision": "f64"},
-        bodies=[{"name": "b", "material": JELLY, "shape": ball}],
+        body("b", JELLY, ball), size=[4.0] * d if d == 2 else [2.0] * d, spacing=h, end=0.5, precision="f64"
     )
     scene = with_colliders(scene, [post, held])
     frames = run(scene, backend_of("f64", 1))
@@ -532,7 +488,7 @@ def test_a_collider_stands_as_it_should_after_many_turns(backend_of: Callable, d
     d, axis = dimension, {"axis": [1.0, -2.0, 0.5]} if dimension == 3 else {}
     box = {"box": {"min": [0.4] * d, "max": [0.5] * d}}
     body = {"name": "b", "material": {"law": "fluid", "density": 1e3, "bulk_modulus": 1e4}, "shape": box}
-    scene = scene_of(domain={"size": [1.0] * d, "spacing": 0.1}, time={"end": 1.0, "frames": 1}, bodies=[body])
+    scene = scene_of(body, domain={"size": [1.0] * d, "spacing": 0.1})
     turns = [0.8, 1.3, 12.6, -7.2, -1000.4]
     scene = with_colliders(
         scene,
@@ -543,8 +499,8 @@ def test_a_collider_stands_as_it_should_after_many_turns(backend_of: Callable, d
     device.write(scene)
     motion.write(scene)
     begin_step(motion)
-    for k, (collider, n) in enumerate(zip(scene.colliders, turns, strict=True)):
-        expected = collider.motion.pose(0.0)[1]
+    for k, (one, n) in enumerate(zip(scene.colliders, turns, strict=True)):
+        expected = one.motion.pose(0.0)[1]
         assert np.abs(device.turned[k].to_numpy() - expected).max() < 1e-9 * max(1.0, abs(n)), n
 
 
@@ -573,3 +529,29 @@ def test_a_torque_is_the_arm_times_the_force(backend_of: Callable, dimension: in
     full_arms, full_impulses = (np.pad(vectors, ((0, 0), (0, 3 - d))) for vectors in (arms, impulses))
     torque = np.cross(full_arms, full_impulses)[:, [2] if d == 2 else [0, 1, 2]]
     assert np.abs(found - np.hstack([impulses, torque])).max() < 1e-14
+
+
+@pytest.mark.gpu
+def test_a_run_on_a_gpu_follows_the_cpu(backend_of: Callable) -> None:
+    """Equal steps between colliders at rest and moving: positions to round-off, forces after twenty to 1e-5.
+
+    Later, rounding decides where grains go: after sixty steps one in ten may be elsewhere, by less than 1e-3 m.
+    """
+    scene = scene_named("colliders")
+    found = []
+    for arch in ("vulkan", "cpu"):
+        run = build_run(scene, backend_of("f32", 1, arch))
+        for _ in range(20):
+            run.step(2e-4)
+        _, row = run.frame()
+        for _ in range(40):
+            run.step(2e-4)
+        found.append((run.frame()[0], np.array(row.collider_force), np.array(row.collider_torque)))
+    (own, force, torque), (other, expected_force, expected_torque) = found
+    apart = np.abs(own.position - other.position).max(axis=1)
+    assert np.quantile(apart, 0.9) < farthest(other.position, other.velocity, 60, other.time)
+    assert apart.max() < 1e-3
+    scale = np.abs(expected_force).max()
+    assert scale > 10
+    assert np.abs(force - expected_force).max() < 1e-5 * scale
+    assert np.abs(torque - expected_torque).max() < 1e-5 * np.abs(expected_torque).max()

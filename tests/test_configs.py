@@ -16,15 +16,9 @@ SCENES = sorted(CONFIGS.glob("*.toml"))
 # Those that run by default: a fluid in 3D, an emitter, a rigid body on a hinge, contact of surfaces, sand on colliders,
 # snow, a yield stress, and the scene that test_docs.py runs. Other tests run the other laws and features.
 USUAL = {
-    "couette_2d",
-    "dam_break_3d",
-    "fountain_2d",
-    "mud_slump_2d",
-    "paddle_wheel_2d",
-    "sand_obstacles_2d",
-    "snowball_wall_2d",
-    "stack_2d",
-}
+    "couette_2d", "dam_break_3d", "fountain_2d", "mud_slump_2d", "paddle_wheel_2d", "sand_obstacles_2d",
+    "snowball_wall_2d", "stack_2d",
+}  # fmt: skip
 
 
 def test_these_are_the_scenes():

@@ -1,8 +1,8 @@
 """One table says who meets whom, by which method, and with which friction; `mpmcli check` prints it."""
 
-from check_scenes import SOLID, box
+from check_scenes import SOLID
 from command import run_here
-from solver_state import scene_of
+from scenes import box, scene_of
 
 from mpmcli.scene import Scene
 from mpmcli.scene.contact_table import NODES, PARTICLES, POINTS, SURFACE, ContactTable
@@ -24,7 +24,7 @@ def table(bodies: list[dict], colliders: tuple[dict, ...] = (), walls: object = 
     domain = {"size": [6.0, 2.0], "spacing": 0.05, "walls": walls, "friction": more.pop("friction", 0.0)}
     contact = {"contact": {"default": "auto"}} | more
     time = {"end": 0.1, "frames": 1}
-    return scene_of(domain=domain, time=time, bodies=bodies, colliders=list(colliders), **contact)
+    return scene_of(*bodies, domain=domain, time=time, colliders=list(colliders), **contact)
 
 
 def rows(scene: Scene) -> list[tuple]:

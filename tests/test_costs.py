@@ -2,7 +2,7 @@
 
 import pytest
 from good_scene import GOOD, load
-from solver_state import scene_of
+from scenes import body, scene_of
 
 from mpmcli.check.scene_check import check_scene
 from mpmcli.materials.registry import laws
@@ -26,10 +26,9 @@ def dam(*materials: dict, d: int = 2, n: int = 16) -> Scene:
     """Return blocks of these materials, side by side."""
     boxes = [{"min": [0.25 * k] + [0.0] * (d - 1), "max": [0.25 * (k + 1)] + [0.5] * (d - 1)} for k in range(2)]
     bodies = [
-        {"name": f"b{k}", "material": material, "shape": {"box": box}}
-        for k, (material, box) in enumerate(zip(materials, boxes, strict=False))
+        body(f"b{k}", material, {"box": box}) for k, (material, box) in enumerate(zip(materials, boxes, strict=False))
     ]
-    return scene_of(domain={"size": [1.0] * d, "cells": [n] * d}, time={"end": 1.0, "frames": 10}, bodies=bodies)
+    return scene_of(*bodies, domain={"size": [1.0] * d, "cells": [n] * d}, frames=10)
 
 
 def test_every_law_is_in_the_table() -> None:

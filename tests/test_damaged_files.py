@@ -26,12 +26,8 @@ from mpmcli.scene.toml_file import apply_overrides, copied, too_deep
 CORPUS = ROOT / "tests" / "corpus"
 READ = [("info", "{}"), ("check", "{}"), ("info", "{}", "--verify"), ("plot", "{}"), ("export", "{}", "--to", "npz")]
 SCENE = """\
-[domain]
-size = [2.0, 2.0, 2.0]
-cells = [16, 16, 16]
-[time]
-end = 0.1
-frames = 4
+domain = {{ size = [2.0, 2.0, 2.0], cells = [16, 16, 16] }}
+time = {{ end = 0.1, frames = 4 }}
 [[bodies]]
 name = "thing"
 material = "jelly"

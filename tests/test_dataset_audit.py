@@ -221,11 +221,7 @@ PLANTS: dict[str, tuple[str, str, Callable[[Path], None]]] = {
         change_h5("valid.h5", "00000/position", lambda x: set_at((5, 3), 0.3)(x, 1)),
     ),
     "frames left out": ("gns", "counts", gns(lambda x, k: x[:8] if k == 1 else x)),
-    "a kick": (
-        "stranger",
-        "momentum",
-        gns(lambda x, k: kicked(x) if k == 2 else x),
-    ),
+    "a kick": ("stranger", "momentum", gns(lambda x, k: kicked(x) if k == 2 else x)),
     "a kick, npz": ("npz", "momentum", change_npz("position", kicked)),
     "velocities of other frames": ("npz", "dt", change_npz("velocity", lambda u: u[1:])),
     "a trajectory lost": ("npz", "splits", lambda path: (path / "000001.npz").unlink()),

@@ -122,17 +122,13 @@ BEGIN, END = MARKS
 HOWS = "--resume", "--overwrite"
 
 
-@pytest.mark.parametrize(
-    ("above", "old", "below"),
-    [
-        (b"# Ours\r\n\r\nCite us: \xff.\r\n\n", b"", b""),
-        (b"Above.\n", BEGIN + b"\nold\n" + END + b"\n", b"Below.\n"),
-        (BEGIN + b"\nno end\n\n", b"", b""),
-        (BEGIN + b"\nno end\n", BEGIN + b"\nold\n" + END + b"\n", b"Below.\n"),
-        (b"---\nlicense: mit\n---\nAbove.\n", BEGIN + b"\nold\n" + END + b"\n", b"Below.\n"),
-    ],
-    ids=["no marks", "marks", "no end mark", "a mark too many", "front matter"],
-)
+@pytest.mark.parametrize(("above", "old", "below"), [
+    (b"# Ours\r\n\r\nCite us: \xff.\r\n\n", b"", b""),
+    (b"Above.\n", BEGIN + b"\nold\n" + END + b"\n", b"Below.\n"),
+    (BEGIN + b"\nno end\n\n", b"", b""),
+    (BEGIN + b"\nno end\n", BEGIN + b"\nold\n" + END + b"\n", b"Below.\n"),
+    (b"---\nlicense: mit\n---\nAbove.\n", BEGIN + b"\nold\n" + END + b"\n", b"Below.\n"),
+], ids=["no marks", "marks", "no end mark", "a mark too many", "front matter"])  # fmt: skip
 def test_the_text_of_its_owner_is_kept(above, old, below):
     """Byte for byte, around the card; written twice, the file is the same. Front matter of the owner replaces ours."""
     dataset = make_dataset("whole")

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from made_sweep import made_workers, make_dataset, small_sweep  # noqa: F401
+from scenes import slow
 from tiny_sweep import contents, told
 
 from mpmcli.dataset.dataset import open_dataset
@@ -22,10 +23,7 @@ from mpmcli.dataset.sweep_run import SweepSettings, run_sweep
 from mpmcli.errors import InputError
 from mpmcli.output.lock import LOCK
 
-pytestmark = [
-    pytest.mark.usefixtures("made_workers"),
-    pytest.mark.parametrize("kills", [2, pytest.param(10, marks=pytest.mark.slow)]),
-]
+pytestmark = [pytest.mark.usefixtures("made_workers"), pytest.mark.parametrize("kills", [2, slow(10)])]
 DATASET = Path("d")
 
 

@@ -102,17 +102,14 @@ def test_bytes_do_not_depend_on_the_time_or_the_place_of_writing(tmp_path):
     assert len(digests) == 2
 
 
-@pytest.mark.parametrize(
-    ("fault", "sentence"),
-    [
-        ({"split": "training"}, "split"),
-        ({"velocity": np.zeros((3, 2, 2))}, "position and velocity"),
-        ({"fields": {"time": np.zeros((11, 24))}}, "cannot name a field"),
-        ({"fields": {"pressure": np.zeros((11, 2))}}, "pressure must be"),
-        ({"body": np.zeros(3)}, "24 entries"),
-        ({"time": np.zeros(3)}, "11 entries"),
-    ],
-)
+@pytest.mark.parametrize(("fault", "sentence"), [
+    ({"split": "training"}, "split"),
+    ({"velocity": np.zeros((3, 2, 2))}, "position and velocity"),
+    ({"fields": {"time": np.zeros((11, 24))}}, "cannot name a field"),
+    ({"fields": {"pressure": np.zeros((11, 2))}}, "pressure must be"),
+    ({"body": np.zeros(3)}, "24 entries"),
+    ({"time": np.zeros(3)}, "11 entries"),
+])  # fmt: skip
 def test_a_trajectory_that_contradicts_itself_is_not_written(tmp_path, fault, sentence):
     with h5py.File(tmp_path / "shard.h5", "w") as file:
         with pytest.raises(ValueError, match=sentence):

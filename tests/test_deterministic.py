@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 import taichi as ti
 from rounding import farthest
-from solver_state import masses_of, scene_of
+from scenes import block, scene_of
+from solver_state import masses_of
 from test_batch import batch_of, outputs_of, same, scene_named
 
 from mpmcli.scene import BodyParticles, Scene, sample_bodies
@@ -40,27 +41,16 @@ def mixed(
     dimension: int, materials: Sequence[dict] = (WATER, JELLY, SAND), *, deterministic: bool = True, **solver: object
 ) -> Scene:
     """Return bodies that meet: water, a jelly that averages its volumes, and sand, or others."""
-    low = (0.0, 0.0, 0.0), (0.45, 0.1, 0.2), (0.1, 0.4, 0.1)
+    d, low = dimension, ((0.0, 0.0, 0.0), (0.45, 0.1, 0.2), (0.1, 0.4, 0.1))
     high = (0.4, 0.3, 0.9), (0.65, 0.4, 0.7), (0.5, 0.7, 0.5)
     bodies = [
-        {
-            "name": f"body {k}",
-            "material": material,
-            "shape": {"box": {"min": list(first[:dimension]), "max": list(last[:dimension])}},
-            "velocity": [speed, -0.5, 0.0][:dimension],
-            "sampling": "jittered",
-        }
+        block(f"body {k}", material, first[:d], last[:d], velocity=[speed, -0.5, 0.0][:d], sampling="jittered")
         for k, (material, first, last, speed) in enumerate(zip(materials, low, high, (1.0, -1.0, -1.0), strict=False))
     ]
     return scene_of(
-        domain={
-            "size": [1.0] * dimension,
-            "spacing": 0.1,
-            "gravity": [0.0, -9.81, 0.0][:dimension],
-            "walls": "separate",
-        },
+        *bodies,
+        domain={"size": [1.0] * d, "spacing": 0.1, "gravity": [0.0, -9.81, 0.0][:d], "walls": "separate"},
         time={"end": 0.12, "frames": 3},
-        bodies=bodies,
         solver={"deterministic": deterministic, **solver},
     )
 
@@ -199,10 +189,9 @@ def momentum_of(run: Run) -> np.ndarray:
 def lone_pool() -> Scene:
     """Return 256 cells of water, at rest."""
     return scene_of(
+        block("pool", WATER, [0.2, 0.2], [1.8, 1.8]),
         domain={"size": [2.0, 2.0], "spacing": 0.1, "gravity": [0.0, 0.0]},
-        time={"end": 1.0, "frames": 1},
-        bodies=[{"name": "pool", "material": WATER, "shape": {"box": {"min": [0.2, 0.2], "max": [1.8, 1.8]}}}],
-        solver={"deterministic": True},
+        deterministic=True,
     )
 
 

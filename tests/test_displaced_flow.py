@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from solver_state import scene_of
+from scenes import block, body, box, scene_of
 
 from mpmcli.scene import Scene
 from mpmcli.scene.bounds import scene_bounds
@@ -12,10 +12,6 @@ from mpmcli.scene.displaced_flow import AROUND, JET, displaced_flow
 
 H, U = 0.01, 0.1
 WATER = {"law": "fluid", "density": 1000.0, "viscosity": 0.0}
-
-
-def box(low: list, high: list) -> dict:
-    return {"box": {"min": low, "max": high}}
 
 
 def syringe(
@@ -30,20 +26,12 @@ def syringe(
     barrel = [tube(-0.2, 0.4, 0.1), tube(0.35, 0.4 + long, 0.02), tube(0.4 + long, 1.0, 0.3)]
     bore = {"add": [tube(0.4, 0.4 + long, 0.02)]}
     return scene_of(
-        domain={
-            "size": [0.7, *[width] * (d - 1)],
-            "spacing": H,
-            "gravity": [0.0] * d,
-            "walls": {"default": "separate", "x_max": "open"},
-        },
-        time={"end": 0.5, "frames": 1},
-        bodies=[{"name": "body", "material": material, "shape": tube(0.2 + gap, 0.4, 0.1) | bore}],
+        body("body", material, tube(0.2 + gap, 0.4, 0.1) | bore),
+        domain={"size": [0.7, *[width] * (d - 1)], "spacing": H, "gravity": [0.0] * d},
+        walls={"default": "separate", "x_max": "open"},
+        end=0.5,
         colliders=[
-            {
-                "name": "barrel",
-                "wall": wall,
-                "shape": tube(-0.2, 0.9, 0.4) | {"subtract": barrel},
-            },
+            {"name": "barrel", "wall": wall, "shape": tube(-0.2, 0.9, 0.4) | {"subtract": barrel}},
             {"name": "piston", "shape": tube(-0.3, 0.2, 0.1), **(motion or {"velocity": [U] + [0.0] * (d - 1)})},
         ],
     )
@@ -91,9 +79,8 @@ def test_the_pressure_of_a_paste_is_above_that_of_slip_lines(n: float) -> None:
     tau, k = 5000.0, 100.0
     paste = {"law": "viscoplastic", "density": 2400.0, "yield_stress": tau, "consistency": k, "flow_index": n}
     scene = scene_of(
+        block("concrete", paste, [0.1, 0.0], [0.6, 0.2]),
         domain={"size": [1.2, 0.2], "spacing": H, "gravity": [0.0, 0.0], "walls": "slip"},
-        time={"end": 1.0, "frames": 1},
-        bodies=[{"name": "concrete", "material": paste, "shape": box([0.1, 0.0], [0.6, 0.2])}],
         colliders=[
             {"name": "piston", "velocity": [U, 0.0], "shape": box([-0.4, -0.1], [0.1, 0.3])},
             {"name": "low", "shape": box([0.6, -0.1], [0.8, 0.05])},
@@ -112,9 +99,8 @@ def test_the_pressure_of_a_paste_is_above_that_of_slip_lines(n: float) -> None:
 def test_a_plate_that_presses_a_layer_drives_it_sideways() -> None:
     """v = u L / (2 h) at its edges, with the height h left at the end."""
     scene = scene_of(
+        block("body", WATER, [0.6, 0.0], [1.4, 0.4]),
         domain={"size": [2.0, 0.8], "spacing": 2 * H, "gravity": [0.0, 0.0]},
-        time={"end": 1.0, "frames": 1},
-        bodies=[{"name": "body", "material": WATER, "shape": box([0.6, 0.0], [1.4, 0.4])}],
         colliders=[{"name": "plate", "velocity": [0.0, -0.2], "shape": box([0.6, 0.4], [1.4, 0.6])}],
     )
     assert displaced_flow(scene).speed == pytest.approx(0.2 * 0.8 / (2 * 0.2), rel=0.15)
@@ -124,11 +110,9 @@ def test_a_plate_that_presses_a_layer_drives_it_sideways() -> None:
 def test_what_flows_around_a_collider_is_no_faster(walls: str) -> None:
     paddle, rod = box([0.3, 0.33], [0.7, 0.37]), box([0.1, 0.1], [0.14, 0.3])
     scene = scene_of(
+        body("body", WATER, box([0.0, 0.0], [1.0, 0.7]) | {"subtract": [paddle, rod]}),
         domain={"size": [1.0, 1.0], "spacing": 2 * H, "gravity": [0.0, 0.0], "walls": walls},
-        time={"end": 2.0, "frames": 1},
-        bodies=[
-            {"name": "body", "material": WATER, "shape": box([0.0, 0.0], [1.0, 0.7]) | {"subtract": [paddle, rod]}}
-        ],
+        end=2.0,
         colliders=[
             {"name": "paddle", "angular_velocity": 3.0, "shape": paddle},
             {"name": "rod", "velocity": ["0.2 * cos(5 * t)", 0.0], "shape": rod},
@@ -141,9 +125,8 @@ def test_what_flows_around_a_collider_is_no_faster(walls: str) -> None:
 
 def test_material_that_nothing_lets_out_is_no_fault() -> None:
     scene = scene_of(
+        block("body", WATER, [0.1, 0.0], [1.0, 0.2]),
         domain={"size": [1.0, 0.2], "spacing": 2 * H, "gravity": [0.0, 0.0]},
-        time={"end": 1.0, "frames": 1},
-        bodies=[{"name": "body", "material": WATER, "shape": box([0.1, 0.0], [1.0, 0.2])}],
         colliders=[{"name": "piston", "velocity": [U, 0.0], "shape": box([-1.0, -0.1], [0.1, 0.3])}],
     )
     flow = displaced_flow(scene)
@@ -168,11 +151,7 @@ def test_a_piston_makes_sand_stiffer() -> None:
 def test_a_paste_is_stiff_against_a_punch() -> None:
     """K (1 - J) is (2 + pi) yield stresses at `compressibility` where neither weight nor speed ask for more."""
     paste = {"law": "viscoplastic", "density": 2000.0, "yield_stress": 1e4, "consistency": 1.0, "compressibility": 0.02}
-    scene = scene_of(
-        domain={"size": [1.0, 1.0], "spacing": 0.1, "gravity": [0.0, -9.81]},
-        time={"end": 1.0, "frames": 1},
-        bodies=[{"name": "body", "material": paste, "shape": box([0.2, 0.0], [0.8, 0.5])}],
-    )
+    scene = scene_of(block("body", paste, [0.2, 0.0], [0.8, 0.5]), size=[1.0, 1.0], spacing=0.1, gravity=[0.0, -9.81])
     assert scene.bodies[0].material.bulk_modulus == pytest.approx((2 + math.pi) * 1e4 / 0.02)
 
 
@@ -184,9 +163,8 @@ def test_a_rigid_body_counts_with_its_weight(d: int) -> None:
     hinge = {"joint": {"type": "hinge"}}
     for one, load in ((weight, 7800.0 * 9.81 * 0.5), (weight | hinge, 0.0)):
         scene = scene_of(
+            block("body", WATER, [0.0] * d, [1.0] * (d - 1) + [0.2]),
             domain={"size": [1.0] * d, "spacing": 0.1, "gravity": gravity},
-            time={"end": 1.0, "frames": 1},
-            bodies=[{"name": "body", "material": WATER, "shape": box([0.0] * d, [1.0] * (d - 1) + [0.2])}],
             colliders=[one],
         )
         material = scene.bodies[0].material

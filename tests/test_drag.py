@@ -5,32 +5,31 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from solver_state import scene_of
+from scenes import body, box, scene_of
 
 from mpmcli.errors import InputError
 from mpmcli.frames.ledger import LedgerRow
-from mpmcli.materials.registry import parameter_models
-from mpmcli.scene import Scene, parse_scene
+from mpmcli.scene import Scene
 from mpmcli.solver.engine.run import build_run
 from mpmcli.solver.machine.backend import Backend
 
 G, H = 9.81, 0.05
 SOFT = {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 1e3, "poissons_ratio": 0.3}
-BOX = {"box": {"min": [0.4, 0.4], "max": [0.7, 0.7]}}
+BOX = box([0.4, 0.4], [0.7, 0.7])
 
 
 def flying(forces: list[dict], *, velocity: list[float], gravity: float = 0.0, **tables: object) -> Scene:
     """Return a block far from all walls, and a rigid box beside it that does not meet it."""
     time = {"end": 0.4, "frames": 8} | tables.pop("time", {})
     domain = {"size": [4.0, 4.0], "origin": [-1.0, -3.0], "spacing": H, "gravity": [0.0, gravity]}
-    rigid = {"name": "rigid", "density": 500.0, "shape": {"box": {"min": [1.4, 0.4], "max": [1.6, 0.6]}}}
+    rigid = {"name": "rigid", "density": 500.0, "shape": box([1.4, 0.4], [1.6, 0.6])}
     return scene_of(
+        body("block", SOFT, BOX, velocity=velocity),
         domain=domain,
         time=time,
-        bodies=[{"name": "block", "material": SOFT, "shape": BOX, "velocity": velocity}],
         colliders=[rigid | {"velocity": velocity}],
         forces=forces,
-        solver={"precision": "f64"},
+        precision="f64",
         **tables,
     )
 
@@ -91,14 +90,10 @@ def test_a_spin_decays_with_the_velocity(backend_of: Callable) -> None:
 
 def parsed(acceleration: list[str], **constants: object) -> object:
     """Return the acceleration of a force in a scene with constants."""
-    data = {
-        "domain": {"size": [1.0, 1.0], "spacing": 0.1},
-        "time": {"end": 1.0, "frames": 1},
-        "bodies": [{"name": "block", "material": SOFT, "shape": BOX}],
-        "forces": [{"acceleration": acceleration}],
-    }
-    data |= {"constants": constants} if constants else {}
-    return parse_scene(data, laws=parameter_models()).scene.forces[0].acceleration
+    more = {"constants": constants} if constants else {}
+    forces = [{"acceleration": acceleration}]
+    asked = scene_of(body("block", SOFT, BOX), size=[1.0, 1.0], spacing=0.1, forces=forces, contact={}, **more)
+    return asked.forces[0].acceleration
 
 
 def test_constants_come_before_the_names_of_the_velocity() -> None:

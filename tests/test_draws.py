@@ -50,16 +50,13 @@ def normal_share(mean, deviation, low, high):
 
 
 @pytest.mark.parametrize("method", ["random", "sobol", "latin"])
-@pytest.mark.parametrize(
-    ("text", "share"),
-    [
-        ("uniform = [0.5, 2]", lambda x: (x - 0.5) / 1.5),
-        ("loguniform = [0.01, 10]", lambda x: np.log(x / 0.01) / math.log(1000)),
-        ("normal = [2, 0.5]", normal_share(2, 0.5, 0.5, 3.5)),
-        ("normal = [1, 0.5], within = [0.9, 3]", normal_share(1, 0.5, 0.9, 3)),
-        ("normal = [1, 0.5], within = [2, 4]", normal_share(1, 0.5, 2, 4)),
-    ],
-)
+@pytest.mark.parametrize(("text", "share"), [
+    ("uniform = [0.5, 2]", lambda x: (x - 0.5) / 1.5),
+    ("loguniform = [0.01, 10]", lambda x: np.log(x / 0.01) / math.log(1000)),
+    ("normal = [2, 0.5]", normal_share(2, 0.5, 0.5, 3.5)),
+    ("normal = [1, 0.5], within = [0.9, 3]", normal_share(1, 0.5, 0.9, 3)),
+    ("normal = [1, 0.5], within = [2, 4]", normal_share(1, 0.5, 2, 4)),
+])  # fmt: skip
 def test_draws_follow_their_distribution(text, share, method):
     sweep = sweep_of(varied(f'"time.end" = {{ {text} }}', head=f'{BARE}method = "{method}"'))
     values = np.array(drawn(sweep, "time.end"))
@@ -69,8 +66,7 @@ def test_draws_follow_their_distribution(text, share, method):
 
 
 @pytest.mark.parametrize(
-    ("text", "values"),
-    [("integers = [2, 6]", [2, 3, 4, 5, 6]), ("choice = [1, 4, 16]", [1, 4, 16])],
+    ("text", "values"), [("integers = [2, 6]", [2, 3, 4, 5, 6]), ("choice = [1, 4, 16]", [1, 4, 16])]
 )
 def test_every_value_is_as_likely(text, values):
     found = drawn(sweep_of(varied(f'"time.frames" = {{ {text} }}')), "time.frames")
@@ -277,12 +273,8 @@ def test_a_draw_makes_a_scene_and_leaves_the_sweep_alone():
 
 def test_a_scene_of_rigid_bodies_alone_is_drawn():
     base = """\
-[domain]
-size = [1.0, 1.0]
-cells = [32, 32]
-[time]
-end = 0.1
-frames = 4
+domain = { size = [1.0, 1.0], cells = [32, 32] }
+time = { end = 0.1, frames = 4 }
 [[colliders]]
 name = "ball"
 density = 500.0

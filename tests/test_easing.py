@@ -8,14 +8,15 @@ from runpy import run_path
 import numpy as np
 import pytest
 from conftest import ROOT
-from solver_state import bodies_of, scene_of
+from scenes import ball, body, box, scene_of
+from solver_state import bodies_of
 from test_batch import batch_of, outputs_of
 
 from mpmcli.errors import InputError
 from mpmcli.materials.fluid import Fluid
 from mpmcli.materials.registry import parameter_models
 from mpmcli.materials.sand import Sand
-from mpmcli.scene import Scene, load_scene, parse_scene, sample_bodies
+from mpmcli.scene import Scene, load_scene, sample_bodies
 from mpmcli.solver.engine.run import build_run
 from mpmcli.stability.transfer_factors import EASED_FROM, EASED_TO
 
@@ -33,16 +34,13 @@ def corner(precision: str) -> Scene:
         return {"name": name, "material": material, "shape": shape, "sampling": "jittered"}
 
     return scene_of(
+        body("pool", WATER, box([0.0, 0.0], [0.15, 0.1])),
+        body("jelly", JELLY, box([0.0, 0.1], [0.1, 0.16])),
+        body("drop", WATER, ball([0.3, 0.3], 0.03)),
+        body("lone", WATER, box([0.31, 0.1], [0.32, 0.11])),
+        body("on a wall", WATER, box([0.39, 0.19], [0.4, 0.2])),
         domain={"size": [0.4, 0.4], "spacing": H},
-        time={"end": 1.0, "frames": 1},
-        solver={"precision": precision},
-        bodies=[
-            body("pool", WATER, {"box": {"min": [0.0, 0.0], "max": [0.15, 0.1]}}),
-            body("jelly", JELLY, {"box": {"min": [0.0, 0.1], "max": [0.1, 0.16]}}),
-            body("drop", WATER, {"ball": {"center": [0.3, 0.3], "radius": 0.03}}),
-            body("lone", WATER, {"box": {"min": [0.31, 0.1], "max": [0.32, 0.11]}}),
-            body("on a wall", WATER, {"box": {"min": [0.39, 0.19], "max": [0.4, 0.2]}}),
-        ],
+        precision=precision,
     )
 
 
@@ -120,13 +118,12 @@ def clusters(d: int, seed: int, folder: Path, fall: float, **time: object) -> Sc
     file, speeds = folder / f"{d}.csv", [f"v{a}" for a in names]
     np.savetxt(file, np.concatenate(rows), delimiter=",", header=",".join(names + speeds), comments="")
     points = {"file": file.name, "spacing": H / 2, "velocity": speeds}
-    tables = {
-        "contact": {"default": "stick"},
-        "domain": {"size": [edge * cells * H] * d, "spacing": H, "gravity": [0.0] * (d - 1) + [-fall]},
-        "time": {"frames": 50} | time,
-        "bodies": [{"name": "drops", "material": WATER, "shape": {"points": points}}],
-    }
-    return parse_scene(tables, laws=parameter_models(), directory=folder).scene
+    return scene_of(
+        body("drops", WATER, {"points": points}),
+        domain={"size": [edge * cells * H] * d, "spacing": H, "gravity": [0.0] * (d - 1) + [-fall]},
+        time={"frames": 50} | time,
+        directory=folder,
+    )
 
 
 @pytest.mark.parametrize("d", [2, pytest.param(3, marks=pytest.mark.slow)])
@@ -172,17 +169,13 @@ def test_lone_grains_stop_by_friction(backend_of: Callable, tmp_path: Path) -> N
     rows = [[0.05 + 12 * k * h, 0.1 * (k + 1) * h, 1.0, 0.0] for k in range(10)]
     np.savetxt(tmp_path / "grains.csv", rows, delimiter=",", header="x,y,vx,vy", comments="")
     points = {"file": "grains.csv", "spacing": h / 2, "velocity": ["vx", "vy"]}
-    tables = {
-        "domain": {
-            "size": [1.5, 0.1],
-            "spacing": h,
-            "gravity": [0.0, -G],
-            "walls": {"default": "slip", "y_min": "stick"},
-        },
-        "time": {"end": 0.3, "frames": 30},
-        "bodies": [{"name": "grains", "material": SAND, "shape": {"points": points}}],
-    }
-    scene = parse_scene(tables, laws=parameter_models(), directory=tmp_path).scene
+    scene = scene_of(
+        body("grains", SAND, {"points": points}),
+        domain={"size": [1.5, 0.1], "spacing": h, "gravity": [0.0, -G], "walls": {"default": "slip", "y_min": "stick"}},
+        time={"end": 0.3, "frames": 30},
+        contact={},
+        directory=tmp_path,
+    )
     run = build_run(scene, backend_of("f32", 1))
     for frame, _ in run.frames():
         v = bodies_of(run)["grains"].v

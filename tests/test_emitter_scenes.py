@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 from good_scene import GOOD, load, refusal
+from scenes import ball, block, body, box, scene_of
 from scipy.spatial import cKDTree
-from solver_state import scene_of
 
 from mpmcli.errors import InputError
 from mpmcli.scene import Scene, estimate_particles, sample_bodies, scene_to_toml
@@ -15,7 +15,7 @@ from mpmcli.scene.sheets import fastest_inflow, mouth_of, sheets_of
 # For integrals of rates.
 TIMES = np.linspace(0.0, 1.0, 20_001)
 WATER = {"law": "fluid", "density": 1000.0, "bulk_modulus": 2e4}
-JET = {"name": "jet", "material": WATER, "shape": {"box": {"min": [0.1, 0.2], "max": [0.3, 0.5]}}}
+JET = block("jet", WATER, [0.1, 0.2], [0.3, 0.5])
 GOOD_JET = """\
 [[emitters]]
 name = "jet"
@@ -36,30 +36,24 @@ def jet_scene(d: int = 2, **more: object) -> Scene:
     size = [1.0, 1.0, 1.0][:d]
     box = {"min": [0.6, 0.0, 0.0][:d], "max": [0.7, 0.1, 0.1][:d]}
     return scene_of(
+        body("pool", WATER, {"box": box}),
         domain={"size": size, "spacing": 0.05},
-        time={"end": 1.0, "frames": 2},
-        bodies=[{"name": "pool", "material": WATER, "shape": {"box": box}}],
+        frames=2,
         emitters=[{**JET, "velocity": [2.0, 0.0, 0.0][:d], **more}],
     )
 
 
-@pytest.mark.parametrize(
-    ("shape", "velocity", "area"),
-    [
-        ({"box": {"min": [0.1, 0.2], "max": [0.3, 0.5]}}, [2.0, 0.0], 0.3),
-        ({"box": {"min": [0.1, 0.2], "max": [0.3, 0.5]}}, [0.0, -1.0], 0.2),
-        # Through the centre at 45 degrees, from one long side to the other.
-        ({"box": {"min": [0.1, 0.2], "max": [0.3, 0.5]}}, [1.0, 1.0], 0.2 * math.sqrt(2)),
-        ({"ball": {"center": [0.4, 0.4], "radius": 0.13}}, [1.0, 3.0], 0.26),
-        ({"box": {"min": [0.1, 0.2, 0.3], "max": [0.3, 0.5, 0.7]}}, [0.0, 0.0, 3.0], 0.06),
-        ({"ball": {"center": [0.4, 0.4, 0.4], "radius": 0.2}}, [1.0, 1.0, 1.0], math.pi * 0.04),
-        (
-            {"cylinder": {"base": [0.4, 0.2, 0.4], "axis": [0, 1, 0], "radius": 0.2, "height": 0.1}},
-            [0.0, -1.0, 0.0],
-            math.pi * 0.04,
-        ),
-    ],
-)
+@pytest.mark.parametrize(("shape", "velocity", "area"), [
+    (box([0.1, 0.2], [0.3, 0.5]), [2.0, 0.0], 0.3),
+    (box([0.1, 0.2], [0.3, 0.5]), [0.0, -1.0], 0.2),
+    # Through the centre at 45 degrees, from one long side to the other.
+    (box([0.1, 0.2], [0.3, 0.5]), [1.0, 1.0], 0.2 * math.sqrt(2)),
+    (ball([0.4, 0.4], 0.13), [1.0, 3.0], 0.26),
+    (box([0.1, 0.2, 0.3], [0.3, 0.5, 0.7]), [0.0, 0.0, 3.0], 0.06),
+    (ball([0.4, 0.4, 0.4], 0.2), [1.0, 1.0, 1.0], math.pi * 0.04),
+    ({"cylinder": {"base": [0.4, 0.2, 0.4], "axis": [0, 1, 0], "radius": 0.2, "height": 0.1}}, [0.0, -1.0, 0.0],
+     math.pi * 0.04),
+])  # fmt: skip
 def test_the_mouth_is_the_section_and_the_flow_its_area_times_the_speed(shape, velocity, area):
     """The area to 2e-3, of which the flow is a multiple, whatever the sampling; all enter two cells before it."""
     for sampling in ("lattice", "turned", "jittered"):
@@ -97,8 +91,8 @@ def test_the_mouth_is_the_section_and_the_flow_its_area_times_the_speed(shape, v
 )
 def test_a_nozzle_begins_at_what_is_before_the_mouth(centre, velocity, cells):
     """Two cells before the mouth, or at a face, a collider, or a body, to a quarter of a cell."""
-    shape = {"box": {"min": [x - 0.02 for x in centre], "max": [x + 0.02 for x in centre]}}
-    lid = {"name": "lid", "shape": {"box": {"min": [0.1, 0.7], "max": [0.5, 0.9]}}}
+    shape = box([x - 0.02 for x in centre], [x + 0.02 for x in centre])
+    lid = {"name": "lid", "shape": box([0.1, 0.7], [0.5, 0.9])}
     asked = jet_scene(shape=shape, velocity=velocity).model_dump(exclude_none=True, exclude={"domain": {"cells"}})
     asked = scene_of(**asked | {"colliders": [lid]})
     sheets = sheets_of(asked.emitters[0], asked)
@@ -218,7 +212,7 @@ def test_sheets_of_a_rate_that_varies(dimension: int, name: str) -> None:
     """The volume that is due by any time is the integral of the rate, to a sheet; each sheet enters at rate / area."""
     rate, volume = RATES[name]
     d, low, high = dimension, [0.2] * dimension, [0.4] * dimension
-    asked = jet_scene(d, velocity=[0.0] * (d - 1) + [-3.0], rate=rate, shape={"box": {"min": low, "max": high}})
+    asked = jet_scene(d, velocity=[0.0] * (d - 1) + [-3.0], rate=rate, shape=box(low, high))
     sheets = sheets_of(asked.emitters[0], asked)
     own = sheets.size * sheets.volume
     entered = own * np.arange(1, sheets.count)
@@ -232,7 +226,7 @@ def test_sheets_of_a_rate_that_varies(dimension: int, name: str) -> None:
     assert fastest_inflow(asked.emitters[0], 1.0) == pytest.approx(expected.max(), rel=1e-3)
     if name == "number":
         speed = 0.025 / sheets.mouth.area
-        same = jet_scene(d, velocity=[0.0] * (d - 1) + [-speed], shape={"box": {"min": low, "max": high}})
+        same = jet_scene(d, velocity=[0.0] * (d - 1) + [-speed], shape=box(low, high))
         assert sheets_of(same.emitters[0], same).due == pytest.approx(sheets.due)
 
 

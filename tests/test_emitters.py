@@ -1,12 +1,12 @@
 """Particles that come and go: a jet against its closed form, runs of a batch against those alone, what a file says."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from command import run_here
-from solver_state import scene_of
+from scenes import ball, block, body, box, scene_of
 from state_run import MATERIALS
 from test_batch import Output, batch_of, outputs_of, same
 from test_deterministic import on_gpu_path
@@ -23,19 +23,13 @@ WATER = {"law": "fluid", "density": 1000.0, "bulk_modulus": 2e4}
 SPEED, SPACING = 2.0, 0.0125
 
 
-def box(low: Sequence[float], high: Sequence[float]) -> dict:
-    return {"box": {"min": list(low), "max": list(high)}}
-
-
 def jet_scene(**more: object) -> Scene:
     """Return a jet through empty space, from x = 0.125 to an open face at 1.0, beside a pool at rest."""
     tables = {
         "domain": {"size": [1.0, 0.5], "spacing": 2 * SPACING, "walls": {"default": "separate", "x_max": "open"}},
         "time": {"end": 0.6, "frames": 6},
-        "bodies": [{"name": "pool", "material": WATER, "shape": box([0.3, 0.0], [0.4, 0.05])}],
-        "emitters": [
-            {"name": "jet", "material": WATER, "shape": box([0.1, 0.2], [0.15, 0.3]), "velocity": [SPEED, 0.0]}
-        ],
+        "bodies": [block("pool", WATER, [0.3, 0.0], [0.4, 0.05])],
+        "emitters": [block("jet", WATER, [0.1, 0.2], [0.15, 0.3], velocity=[SPEED, 0.0])],
         "output": {"fields": ["velocity", "density", "pressure", "volume_ratio", "mass"]},
     }
     return scene_of(**tables | more)
@@ -53,34 +47,28 @@ def mixed_scene(other: bool = False) -> Scene:
             "walls": {"default": "separate", "x_max": "open", "y_min": "open"},
         },
         time={"end": 0.4 + 0.1 * other, "frames": 4},
-        bodies=[{"name": "block", "material": MATERIALS["snow"], "shape": box([0.5, 0.1], [0.8, 0.2])}],
+        bodies=[block("block", MATERIALS["snow"], [0.5, 0.1], [0.8, 0.2])],
         emitters=[
-            {
-                "name": "jet",
-                "material": MATERIALS["fluid"],
-                "shape": box([0.1, 0.2], [0.15, 0.3]),
-                "velocity": [speed, 0.5],
-                "end": 0.3,
-            },
-            {
-                "name": "hail",
-                "material": MATERIALS["snow"],
-                "shape": {"ball": {"center": [0.6, 0.4], "radius": 0.06 - 0.02 * other}},
-                "velocity": [0.0, -1.0],
-                "sampling": "jittered",
-                "seed": 3 + other,
-                "start": 0.1,
-                "volume": 0.015,
-            },
+            block("jet", MATERIALS["fluid"], [0.1, 0.2], [0.15, 0.3], velocity=[speed, 0.5], end=0.3),
+            body(
+                "hail",
+                MATERIALS["snow"],
+                ball([0.6, 0.4], 0.06 - 0.02 * other),
+                velocity=[0.0, -1.0],
+                sampling="jittered",
+                seed=3 + other,
+                start=0.1,
+                volume=0.015,
+            ),
             # In the middle of the jet.
-            {
-                "name": "blocked",
-                "material": MATERIALS["fluid"],
-                "shape": {"ball": {"center": [0.2, 0.25], "radius": 0.05}},
-                "velocity": [0.0, -1.0],
-                "sampling": "lattice" if other else "turned",
-                "start": 0.1,
-            },
+            body(
+                "blocked",
+                MATERIALS["fluid"],
+                ball([0.2, 0.25], 0.05),
+                velocity=[0.0, -1.0],
+                sampling="lattice" if other else "turned",
+                start=0.1,
+            ),
         ],
         output={"fields": ["velocity", "volume_ratio", "stress"]},
     )
@@ -135,7 +123,7 @@ def test_the_jet_flows_as_its_velocity_says(jet: Output) -> None:
 
 def test_other_material_passes_a_nozzle(backend_of: Callable[..., Backend]) -> None:
     """A block of the same law flies across the nozzle before anything enters, and keeps its velocity."""
-    block = {"name": "pool", "material": WATER, "shape": box([0.075, 0.025], [0.125, 0.1]), "velocity": [0.0, 1.0]}
+    block = body("pool", WATER, box([0.075, 0.025], [0.125, 0.1]), velocity=[0.0, 1.0])
     emitter = jet_scene().model_dump(exclude_none=True)["emitters"][0] | {"start": 0.5}
     scene = jet_scene(bodies=[block], emitters=[emitter], time={"end": 0.6, "frames": 6})
     for frame, _ in outputs_of(batch_of([scene], backend_of("f32", 1)), [scene])[0][:4]:
@@ -145,7 +133,7 @@ def test_other_material_passes_a_nozzle(backend_of: Callable[..., Backend]) -> N
 def test_a_jet_whose_rate_varies(backend_of: Callable[..., Backend]) -> None:
     """The mass is rho int q dt, to two sheets and a step, and the momentum rho int q^2 dt / area."""
     pulse = {"velocity": [1.0, 0.0], "rate": "0.2 * (0.6 + 0.4 * cos(9*t))"}
-    emitter = {"name": "jet", "material": WATER, "shape": box([0.1, 0.2], [0.15, 0.3]), **pulse}
+    emitter = block("jet", WATER, [0.1, 0.2], [0.15, 0.3], **pulse)
     scene = jet_scene(emitters=[emitter])
     rows = [row for _, row in outputs_of(batch_of([scene], backend_of("f32", 1)), [scene])[0]]
     for row in rows:
@@ -165,7 +153,7 @@ def test_a_rope_hangs_on_its_nozzle(backend_of: Callable[..., Backend], safety: 
     modulus, density, speed, g = 3e4, 1000.0, 0.5, 9.81
     jelly = {"law": "neo_hookean", "density": density, "youngs_modulus": modulus, "poissons_ratio": 0.3}
     domain = {"size": [0.4, 0.8], "spacing": 0.02, "gravity": [0.0, -g]}
-    emitter = {"name": "rope", "material": jelly, "shape": box([0.16, 0.68], [0.24, 0.72]), "velocity": [0.0, -speed]}
+    emitter = block("rope", jelly, [0.16, 0.68], [0.24, 0.72], velocity=[0.0, -speed])
     asked = scene_of(domain=domain, time={"end": 0.5, "frames": 5, "safety": safety}, emitters=[emitter])
     frames = [frame.of_present for frame, _ in build_run(asked, backend_of("f64", 1)).frames()]
     first, frame = frames[1], frames[-1]

@@ -8,7 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scenes
 from command import run_here
+from scenes import block
 
 from mpmcli.error_bars import report
 from mpmcli.error_bars.bars import FLOOR, MARGIN, MATTERS, bars_of
@@ -132,16 +134,13 @@ def test_runs_part_where_rounding_moves_half_a_percent_of_the_mass() -> None:
     assert bars_of(series_of(), []).parted is None
 
 
-@pytest.mark.parametrize(
-    ("value", "bar", "said"),
-    [
-        (0.8314, 0.0234, "0.831 ± 0.023"),
-        (0.8314, 0.051, "0.83 ± 0.05"),
-        (12401, 54.2, "12401 ± 54"),
-        (0.2, 3, "0 ± 3"),
-        (0.459, 0.0099, "0.459 ± 0.010"),
-    ],
-)
+@pytest.mark.parametrize(("value", "bar", "said"), [
+    (0.8314, 0.0234, "0.831 ± 0.023"),
+    (0.8314, 0.051, "0.83 ± 0.05"),
+    (12401, 54.2, "12401 ± 54"),
+    (0.2, 3, "0 ± 3"),
+    (0.459, 0.0099, "0.459 ± 0.010"),
+])  # fmt: skip
 def test_a_value_has_the_digits_of_its_bar(value: float, bar: float, said: str) -> None:
     found = bars_of(series_of(a__low__x=value), [(grid(2.0), series_of(a__low__x=value + bar / MARGIN))])
     assert found.of["a.low.x"].text(-1) == said
@@ -349,14 +348,8 @@ def test_the_result_is_plotted_with_bands_and_overwritten_with_its_bars(
 
 def test_a_target_gives_the_spacing_of_first_order() -> None:
     """A bar of 4 % at h = 0.05 asks for 0.025 to stay within 2 %, at 2^3 times the seconds."""
-    scene = parse_scene(
-        {
-            "domain": {"size": [1.0, 0.5], "spacing": 0.05},
-            "time": {"end": 1.0, "frames": 40},
-            "bodies": [{"name": "water", "material": "water", "shape": {"box": {"min": [0, 0], "max": [0.4, 0.4]}}}],
-        },
-        laws=parameter_models(),
-    ).scene
+    water = block("water", "water", [0, 0], [0.4, 0.4])
+    scene = scenes.scene_of(water, size=[1.0, 0.5], spacing=0.05, frames=40, contact={})
     base = series_of(water__high__x=0.5)
     base.seconds = 10.0
     study = Study(scene, base, [(grid(2.0), series_of(water__high__x=0.5 + 0.04 / MARGIN))])
@@ -391,17 +384,14 @@ def test_a_scene_without_siblings_is_told_so(tmp_path: Path) -> None:
     assert (tmp_path / "r" / "particles.vtkhdf").exists()
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (("--level", "step", "--budget", "1h"), "without --level, --only and --skip"),
-        (("--only", "grids"), 'there is no cause "grids"'),
-        (("--skip", "grid"), "leave nothing to compute, as model needs grid"),
-        (("--only", "step", "--skip", "step"), "leave nothing to compute:"),
-        (("--budget", "0.001s"), "allows nothing"),
-        (("--levels", "fine"), "--levels"),
-    ],
-)
+@pytest.mark.parametrize(("words", "said"), [
+    (("--level", "step", "--budget", "1h"), "without --level, --only and --skip"),
+    (("--only", "grids"), 'there is no cause "grids"'),
+    (("--skip", "grid"), "leave nothing to compute, as model needs grid"),
+    (("--only", "step", "--skip", "step"), "leave nothing to compute:"),
+    (("--budget", "0.001s"), "allows nothing"),
+    (("--levels", "fine"), "--levels"),
+])  # fmt: skip
 def test_options_that_cannot_be_used_have_a_sentence(tmp_path: Path, words: tuple[str, ...], said: str) -> None:
     (tmp_path / "drop.toml").write_text(SCENE)
     outcome = run_here("validate", tmp_path / "drop.toml", *words)

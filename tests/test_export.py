@@ -17,17 +17,7 @@ import numpy as np
 import pytest
 import pyvista
 from command import ROOT, run_here
-from exports import (
-    FORMS,
-    FRAMES,
-    GnsReader,
-    coming_and_going,
-    everything,
-    exported,
-    metadata_of,
-    refused,
-    tfrecords,
-)
+from exports import FORMS, FRAMES, GnsReader, coming_and_going, everything, exported, metadata_of, refused, tfrecords
 from made_dataset import PAUSE, SPLITS, made_dataset, made_trajectory, write_dataset
 
 import mpmcli.dataset

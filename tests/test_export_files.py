@@ -228,17 +228,10 @@ def test_time_codes_of_usd_are_frames(tmp_path, stride):
         del points, stage
 
 
-@pytest.mark.parametrize(
-    ("gravity", "up"),
-    [
-        ([0.0, 0.0, -9.81], "Z"),
-        ([0.0, -9.81, 0.0], "Y"),
-        ([0.0, "-g * min(t / 0.05, 1)", 0.0], "Y"),
-        ([0.0, "5 * sin(20 * t)", "-g"], "Z"),
-        ([0.0, "-5 * sin(t)", 0.0], "Y"),
-        ([0.0, 0.0, 0.0], "Z"),
-    ],
-)
+@pytest.mark.parametrize(("gravity", "up"), [
+    ([0.0, 0.0, -9.81], "Z"), ([0.0, -9.81, 0.0], "Y"), ([0.0, "-g * min(t / 0.05, 1)", 0.0], "Y"),
+    ([0.0, "5 * sin(20 * t)", "-g"], "Z"), ([0.0, "-5 * sin(t)", 0.0], "Y"), ([0.0, 0.0, 0.0], "Z"),
+])  # fmt: skip
 def test_up_in_usd_is_against_gravity(tmp_path, gravity, up):
     """Also where it is an expression."""
     usd, geom = (pytest.importorskip(f"pxr.{name}") for name in ("Usd", "UsdGeom"))
@@ -261,8 +254,7 @@ def test_rigid_bodies_alone_are_exported_where_they_can_be(tmp_path, form, dimen
         pose = ((*[0.5] * (dimension - 1), 0.5 - 0.1 * k, *turn),)
         motion = ((0.0,) * (3 * dimension - 3),)
         store.write(
-            drawn(k, np.empty((0, dimension))),
-            replace(row(0.01 * k, dimension), rigid_pose=pose, rigid_motion=motion),
+            drawn(k, np.empty((0, dimension))), replace(row(0.01 * k, dimension), rigid_pose=pose, rigid_motion=motion)
         )
     store.finish()
     outcome = run_here("export", tmp_path / "run", "--to", form, "-o", tmp_path / "out")

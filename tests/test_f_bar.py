@@ -6,7 +6,7 @@ import mpm_reference as reference
 import numpy as np
 import pytest
 from rounding import farthest
-from solver_state import scene_of
+from scenes import ball, body, box, scene_of, slow
 from test_batch import batch_of, outputs_of, same
 
 from mpmcli.scene import Scene, sample_bodies
@@ -22,22 +22,15 @@ def block(
 ) -> Scene:
     """Return a block that flies freely."""
     material = {"law": law, "density": DENSITY, "youngs_modulus": E, "poissons_ratio": NU} | more.pop("material", {})
-    d = dimension
+    d, end, spacing = dimension, more.pop("end", 0.3), more.pop("spacing", H)
     solver = {"precision": "f64", "solids": solids} | more.pop("solver", {})
     return scene_of(
-        domain={"size": [1.0] * d, "spacing": more.pop("spacing", H), "gravity": [*[0.0] * (d - 1), -gravity]},
-        time={"end": more.pop("end", 0.3), "frames": 6},
+        body("block", material, box([0.33] * d, [0.63] * d), velocity=["sin(9*Y)", "-sin(7*X)", "0.4*sin(8*Y)"][:d])
+        | more,
+        domain={"size": [1.0] * d, "spacing": spacing, "gravity": [*[0.0] * (d - 1), -gravity]},
+        time={"end": end, "frames": 6},
         solver=solver,
-        output={"fields": ["velocity", "pressure", "volume_ratio"]},
-        bodies=[
-            {
-                "name": "block",
-                "material": material,
-                "shape": {"box": {"min": [0.33] * d, "max": [0.63] * d}},
-                "velocity": ["sin(9*Y)", "-sin(7*X)", "0.4*sin(8*Y)"][:d],
-                **more,
-            }
-        ],
+        fields=["velocity", "pressure", "volume_ratio"],
     )
 
 
@@ -54,8 +47,7 @@ def shared(x: np.ndarray, F: np.ndarray, volume: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("dimension", "solids"),
-    [(2, "updated"), *(pytest.param(*how, marks=pytest.mark.slow) for how in ((2, "total"), (3, "updated")))],
+    ("dimension", "solids"), [(2, "updated"), *(slow(*how) for how in ((2, "total"), (3, "updated")))]
 )
 def test_steps_are_those_of_plain_numpy(backend_of: Callable, dimension: int, solids: str) -> None:
     """Stress of F with the mean of ln J of the cell, the one at rest where bodies are on the grid at rest.
@@ -112,9 +104,7 @@ def test_steps_are_those_of_plain_numpy(backend_of: Callable, dimension: int, so
     assert np.abs(frame.fields["volume_ratio"][found["id"]] - J).max() < 1e-6
 
 
-@pytest.mark.parametrize(
-    "law", ["neo_hookean", *(pytest.param(law, marks=pytest.mark.slow) for law in ("fixed_corotated", "von_mises"))]
-)
+@pytest.mark.parametrize("law", ["neo_hookean", *(slow(law) for law in ("fixed_corotated", "von_mises"))])
 def test_momenta_stay_and_energy_does_not_grow(backend_of: Callable, law: str) -> None:
     """The mean of the strain and that of the stress are the same projection, so that the force is that of an energy."""
     more = {"poissons_ratio": 0.4999} | ({"yield_stress": 3e3} if law == "von_mises" else {})
@@ -132,16 +122,16 @@ def test_momenta_stay_and_energy_does_not_grow(backend_of: Callable, law: str) -
     ("ratio", "spacing", "rate", "end", "least"),
     [
         (0.49, 0.05, 20.0, 4.0, 0.98),
-        pytest.param(0.499, 0.05, 20.0, 4.0, 0.98, marks=pytest.mark.slow),
+        slow(0.499, 0.05, 20.0, 4.0, 0.98),
         # That of docs/theory.md, 4.4.
-        pytest.param(0.49, 0.02, 12.95, 10.0, 0.995, marks=pytest.mark.slow),
+        slow(0.49, 0.02, 12.95, 10.0, 0.995),
     ],
 )
 def test_a_disc_that_spins_across_the_cells_gains_no_energy(
     backend_of: Callable, ratio: float, spacing: float, rate: float, end: float, least: float
 ) -> None:
     """13 and 20 revolutions; its radius stays. With its own growth F gains 1.6 % in the first, and the last tears."""
-    disc = {"ball": {"center": [0.503, 0.497], "radius": 0.2}}
+    disc = ball([0.503, 0.497], 0.2)
     spin = [f"-{rate}*(Y-0.497)", f"{rate}*(X-0.503)"]
     scene = block(material={"poissons_ratio": ratio}, shape=disc, velocity=spin, end=end, spacing=spacing)
     frames = list(build_run(scene, backend_of("f64", 1)).frames())
@@ -162,7 +152,7 @@ def test_a_disc_whose_particles_lie_between_cells_gains_no_energy(backend_of: Ca
     Its particles lie on faces of cells and change cells in every step: F has the growth of the cell where stress acted.
     """
     scene = block(
-        shape={"ball": {"center": [0.5, 0.48], "radius": 0.32}},
+        shape=ball([0.5, 0.48], 0.32),
         velocity=[0.0, 0.0],
         material={"youngs_modulus": 9.6e6, "poissons_ratio": 0.47, "density": 950.0},
         gravity=9.81,
@@ -179,12 +169,7 @@ def test_a_ball_that_bounces_gains_no_energy(backend_of: Callable, law: str, rat
     """In flight and at the floor; frames count velocities half a step back, which may show 1e-4 of it."""
     material = {"poissons_ratio": ratio} | ({"yield_stress": 2e3} if law == "von_mises" else {})
     scene = block(
-        law=law,
-        material=material,
-        shape={"ball": {"center": [0.5, 0.6], "radius": 0.3}},
-        solver={"f_bar": True},
-        velocity=[0.1, -2.0],
-        end=1.0,
+        law=law, material=material, shape=ball([0.5, 0.6], 0.3), solver={"f_bar": True}, velocity=[0.1, -2.0], end=1.0
     )
     energy = np.array([row.energy for _, row in build_run(scene, backend_of("f64", 1)).frames()])
     assert (np.diff(energy) < 2e-4 * energy[0]).all()
@@ -206,16 +191,13 @@ def test_a_uniform_change_of_volume_is_not_changed(backend_of: Callable) -> None
     assert np.abs(averaged - plain).max() < 1e-12 * np.abs(plain).max()
 
 
-@pytest.mark.parametrize(
-    ("material", "setting", "averages"),
-    [
-        ({"law": "neo_hookean", "poissons_ratio": 0.45}, "auto", False),
-        ({"law": "neo_hookean", "poissons_ratio": 0.46}, "auto", True),
-        ({"law": "neo_hookean", "poissons_ratio": 0.2}, True, True),
-        ({"law": "neo_hookean", "poissons_ratio": 0.49}, False, False),
-        ({"law": "sand", "friction_angle": 30.0, "poissons_ratio": 0.46}, "auto", False),
-    ],
-)
+@pytest.mark.parametrize(("material", "setting", "averages"), [
+    ({"law": "neo_hookean", "poissons_ratio": 0.45}, "auto", False),
+    ({"law": "neo_hookean", "poissons_ratio": 0.46}, "auto", True),
+    ({"law": "neo_hookean", "poissons_ratio": 0.2}, True, True),
+    ({"law": "neo_hookean", "poissons_ratio": 0.49}, False, False),
+    ({"law": "sand", "friction_angle": 30.0, "poissons_ratio": 0.46}, "auto", False),
+])  # fmt: skip
 def test_who_averages(backend_of: Callable, material: dict, setting: object, averages: bool) -> None:
     run = build_run(block(material=material, law=material["law"], solver={"f_bar": setting}), backend_of("f64", 1))
     assert run.groups[0].arrays.uses_f_bar == averages
@@ -224,7 +206,7 @@ def test_who_averages(backend_of: Callable, material: dict, setting: object, ave
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("solids", ["updated", pytest.param("total", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("solids", ["updated", slow("total")])
 def test_a_gpu_follows_the_cpu(backend_of: Callable, solids: str) -> None:
     """Alone and in a batch, with what frames show, to the rounding of sums in another order."""
     scene = block(solids=solids, solver={"precision": "f32"}, end=0.05)

@@ -175,17 +175,14 @@ def test_without_ffmpeg_one_sentence_says_so(pictures, tmp_path, monkeypatch):
         write_film(pictures, tmp_path / "film.mp4", 24)
 
 
-@pytest.mark.parametrize(
-    ("script", "sentence"),
-    [
-        ("echo 'the encoder is not there' >&2; exit 3", "film.mp4, its status is 3: the encoder is not there"),
-        ("cat > /dev/null; exit 1", "film.mp4, its status is 1: it gave no reason"),
-        ("kill -9 $$", "film.mp4, it was ended by signal 9: it gave no reason"),
-        # SIGXFSZ, and the exit status that ffmpeg has after ENOSPC.
-        ("kill -25 $$", r"film.mp4 could not be written \(File too large\)"),
-        ("exit 228", r"film.mp4 could not be written \(No space left on device\)"),
-    ],
-)
+@pytest.mark.parametrize(("script", "sentence"), [
+    ("echo 'the encoder is not there' >&2; exit 3", "film.mp4, its status is 3: the encoder is not there"),
+    ("cat > /dev/null; exit 1", "film.mp4, its status is 1: it gave no reason"),
+    ("kill -9 $$", "film.mp4, it was ended by signal 9: it gave no reason"),
+    # SIGXFSZ, and the exit status that ffmpeg has after ENOSPC.
+    ("kill -25 $$", r"film.mp4 could not be written \(File too large\)"),
+    ("exit 228", r"film.mp4 could not be written \(No space left on device\)"),
+])  # fmt: skip
 def test_an_ffmpeg_that_fails_ends_the_film_and_keeps_the_old_one(pictures, tmp_path, monkeypatch, script, sentence):
     program, path = tmp_path / "ffmpeg", tmp_path / "film.mp4"
     program.write_text(f"#!/bin/sh\n{script}\n", encoding="utf-8")

@@ -74,19 +74,15 @@ def flattened(random: np.random.Generator, count: int, d: int, last: float) -> n
 
 
 @pytest.mark.parametrize("d", [2, 3])
-@pytest.mark.parametrize(
-    "stretches",
-    [
-        lambda random, count, d: np.ones((count, d)),
-        lambda random, count, d: 1 + 0.1 * random.normal(size=(count, d)),
-        wide,
-        lambda random, count, d: flattened(random, count, d, 1e-6),
-        lambda random, count, d: flattened(random, count, d, 0.0),
-        lambda random, count, d: flattened(random, count, d, -0.4),
-        lambda random, count, d: -wide(random, count, d),
-    ],
-    ids=["rotated", "strained", "wide", "nearly flat", "flat", "inverted", "inverted wide"],
-)
+@pytest.mark.parametrize("stretches", [
+    lambda random, count, d: np.ones((count, d)),
+    lambda random, count, d: 1 + 0.1 * random.normal(size=(count, d)),
+    wide,
+    lambda random, count, d: flattened(random, count, d, 1e-6),
+    lambda random, count, d: flattened(random, count, d, 0.0),
+    lambda random, count, d: flattened(random, count, d, -0.4),
+    lambda random, count, d: -wide(random, count, d),
+], ids=["rotated", "strained", "wide", "nearly flat", "flat", "inverted", "inverted wide"])  # fmt: skip
 def test_rotation_is_the_nearest_one(backend: Backend, stretches: Callable, d: int) -> None:
     """R agrees with singular values in f64 to 10 roundings (f32: about 2) times its condition s_1/(s_2 + s_3).
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from scenes import block, stresses
-from solver_state import bodies_of, scene_of
+from scenes import block, body, scene_of, stresses
+from solver_state import bodies_of
 
 from mpmcli.solver.engine.run import build_run
 
@@ -14,16 +14,15 @@ JELLY = {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 1e4, "poisso
 
 def disc(name="disc", center=(0.5, 0.5), radius=0.15, material=CLOUD, **more):
     ball = {"center": list(center), "radius": radius}
-    return {"name": name, "material": dict(material), "shape": {"ball": ball}, **more}
+    return body(name, dict(material), {"ball": ball}, **more)
 
 
 def driven(bodies, *, precision="f64", origin=(0.0, 0.0), gravity=(0.0, 0.0), forces=(), **more):
     return scene_of(
+        *bodies,
         domain={"size": [1.0, 1.0], "spacing": 0.05, "gravity": list(gravity), "origin": list(origin)},
-        time={"end": 1.0, "frames": 1},
-        bodies=list(bodies),
         forces=list(forces),
-        solver={"precision": precision},
+        precision=precision,
         **more,
     )
 

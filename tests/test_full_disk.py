@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command import ROOT, SCENE, run_here
+from scenes import slow
 
 from mpmcli.output import open_result
 
@@ -67,9 +68,7 @@ def check_stop(directory: Path, truth: Path, outcome: subprocess.CompletedProces
     return count
 
 
-@pytest.mark.parametrize(
-    "limit", [300_000, *(pytest.param(round(300 * 1.2**k), marks=pytest.mark.slow) for k in range(45))]
-)
+@pytest.mark.parametrize("limit", [300_000, *(slow(round(300 * 1.2**k)) for k in range(45))])
 def test_a_limit_on_the_size_of_files_stops_a_run(whole: Path, tmp_path: Path, limit: int) -> None:
     size = (whole / "run" / "particles.vtkhdf").stat().st_size
     outcome = run_limited(whole, limit, "simulate", "scene.toml", "-o", tmp_path / "result", "-q")
@@ -128,8 +127,8 @@ def test_a_full_disk_takes_no_run(whole: Path, small_disk: Callable[[int], Path]
     "words",
     [
         ["export", "run", "--to", "npz", "-o", "DISK/exported"],
-        pytest.param(["export", "run", "--to", "vtkhdf", "-o", "DISK/exported"], marks=pytest.mark.slow),
-        pytest.param(["plot", "run", "-o", "DISK/ledger.png"], marks=pytest.mark.slow),
+        slow(["export", "run", "--to", "vtkhdf", "-o", "DISK/exported"]),
+        slow(["plot", "run", "-o", "DISK/ledger.png"]),
     ],
     ids=["npz", "vtkhdf", "plot"],
 )
@@ -141,10 +140,7 @@ def test_a_full_disk_leaves_no_half_files(whole: Path, small_disk: Callable[[int
     assert files_in(place) == []
 
 
-@pytest.mark.parametrize(
-    "form",
-    ["vtkhdf", *(pytest.param(f, marks=pytest.mark.slow) for f in ("npz", "lagrangebench", "zarr", "webdataset"))],
-)
+@pytest.mark.parametrize("form", ["vtkhdf", *(slow(f) for f in ("npz", "lagrangebench", "zarr", "webdataset"))])
 def test_an_export_above_the_limit_of_files_leaves_nothing(whole: Path, tmp_path: Path, form: str) -> None:
     outcome = run_limited(whole, 20_000, "export", "run", "--to", form, "-o", tmp_path / "exported")
     assert outcome.returncode == 1 and "File too large" in outcome.stderr, outcome.stderr

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 from conftest import ROOT
-from solver_state import scene_of
+from scenes import block, liquid, scene_of
 from test_batch import batch_of, scene_named
 from test_deterministic import on_gpu_path
 
@@ -21,17 +21,9 @@ from mpmcli.solver.transfer import run_sums
 from mpmcli.solver.transfer.run_sums import WARP, stored_at
 
 KINDS = (
-    "fluid",
-    "two laws, two bodies of one",
-    "3D, two laws",
-    "3D, AFLIP",
-    "rough walls",
-    "periodic, a wall moves, AFLIP",
-    "periodic, 3D, f_bar",
-    "colliders",
-    "contact",
-    "rigid bodies",
-)
+    "fluid", "two laws, two bodies of one", "3D, two laws", "3D, AFLIP", "rough walls", "periodic, a wall moves, AFLIP",
+    "periodic, 3D, f_bar", "colliders", "contact", "rigid bodies",
+)  # fmt: skip
 
 
 STEPS, STEP = 30, 2.5e-4
@@ -91,16 +83,9 @@ def atomics_of(run: Run, length: int) -> float:
 
 
 POOL = scene_of(
+    block("pool", liquid(1e5), [0.1, 0.1], [0.8, 0.9], velocity=["-2 * Y", "X"]),
     domain={"size": [1.0, 1.0], "cells": [64, 64]},
-    time={"end": 0.15, "frames": 1},
-    bodies=[
-        {
-            "name": "pool",
-            "material": {"law": "fluid", "density": 1000.0, "bulk_modulus": 1e5},
-            "shape": {"box": {"min": [0.1, 0.1], "max": [0.8, 0.9]}},
-            "velocity": ["-2 * Y", "X"],
-        }
-    ],
+    end=0.15,
 )
 
 

@@ -13,13 +13,8 @@ from mpmcli.materials.fluid import FULL
 from mpmcli.output import open_result
 
 FALL = """\
-[domain]
-size = [0.5, 1.0]
-spacing = 0.025
-gravity = [0.0, -9.81]
-[time]
-end = 0.6
-frames = 24
+domain = { size = [0.5, 1.0], spacing = 0.025, gravity = [0.0, -9.81] }
+time = { end = 0.6, frames = 24 }
 [[bodies]]
 name = "water"
 material = { law = "fluid", density = 1000.0 }

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from scenes import GRAVITY, block, restart, scene
+from scenes import GRAVITY, block, body, polygon, restart, scene
 
 from mpmcli.materials.registry import laws
 from mpmcli.scene import BodyParticles, sample_bodies
@@ -23,14 +23,10 @@ WAVE_SPEED = np.sqrt(STIFFNESS / DENSITY)
 SOLID = {"density": DENSITY, "youngs_modulus": YOUNG, "poissons_ratio": NU}
 LIQUID = {"density": DENSITY, "bulk_modulus": STIFFNESS / 2}
 MATERIALS = {
-    "fluid": LIQUID,
-    "viscoplastic": {**LIQUID, "yield_stress": 100.0, "consistency": 1.0},
-    "neo_hookean": SOLID,
-    "fixed_corotated": SOLID,
-    "von_mises": {**SOLID, "yield_stress": YOUNG / 200},
-    "snow": SOLID,
+    "fluid": LIQUID, "viscoplastic": {**LIQUID, "yield_stress": 100.0, "consistency": 1.0}, "neo_hookean": SOLID,
+    "fixed_corotated": SOLID, "von_mises": {**SOLID, "yield_stress": YOUNG / 200}, "snow": SOLID,
     "sand": {**SOLID, "friction_angle": 30.0},
-}
+}  # fmt: skip
 
 
 def test_every_law_is_here() -> None:
@@ -274,11 +270,11 @@ def test_a_raft_floats_as_deep_as_its_weight(backend_of: Callable, record_proper
     level = depth + draught * length / width
     left, right, bottom = (width - length) / 2, (width + length) / 2, level - draught
     notched = [[0, 0], [width, 0], [width, level], [right, level], [right, bottom], [left, bottom], [left, level]]
-    water = {
-        "name": "water",
-        "material": {"law": "fluid", "density": DENSITY, "bulk_modulus": 2e5},
-        "shape": {"polygon": {"vertices": [[float(x) for x in corner] for corner in [*notched, [0, level]]]}},
-    }
+    water = body(
+        "water",
+        {"law": "fluid", "density": DENSITY, "bulk_modulus": 2e5},
+        polygon([[float(x) for x in corner] for corner in [*notched, [0, level]]]),
+    )
     rubber = {"law": "neo_hookean", "density": density, "youngs_modulus": 3e5}
     raft = block("raft", rubber, [left, bottom], [right, bottom + thickness])
     cells = [round(width / h), round(0.9 / h)]

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from solver_state import scene_of
+from scenes import block, scene_of
 
 from mpmcli.scene import sample_bodies
 from mpmcli.scene.entry import value_of
@@ -21,7 +21,7 @@ def test_the_momentum_is_the_integral(backend_of: Callable[..., Backend]) -> Non
         solver={"precision": "f64"},
         domain={"size": [1.0, 1.0], "cells": [40, 40]},
         time={"end": 0.02, "frames": 2},
-        bodies=[{"name": "b", "material": JELLY, "shape": {"box": {"min": [0.3, 0.3], "max": [0.7, 0.7]}}}],
+        bodies=[block("b", JELLY, [0.3, 0.3], [0.7, 0.7])],
         impulses=[
             {**PUSH, "strength": 1.0, "direction": [2.0, 0.0]},
             {**PUSH, "strength": -0.5, "direction": [0.0, 1.0], "falloff": "gaussian", "body": "b"},
@@ -43,9 +43,9 @@ def test_a_direction_of_any_length_pushes_by_the_strength(direction: list[float]
     d = len(direction)
     place = [0.5] * d
     scene = scene_of(
+        block("b", JELLY, [0.3] * d, [0.7] * d),
         domain={"size": [1.0] * d, "cells": [8] * d},
-        time={"end": 1.0, "frames": 2},
-        bodies=[{"name": "b", "material": JELLY, "shape": {"box": {"min": [0.3] * d, "max": [0.7] * d}}}],
+        frames=2,
         impulses=[{**PUSH, "end": 0.5, "center": place, "strength": 2.0, "direction": direction, "falloff": "none"}],
     )
     at = dict(zip("xyz", place, strict=False)) | {"t": 0.2}

@@ -50,18 +50,15 @@ def test_bounds_are_the_range_where_a_name_occurs_once() -> None:
         assert found == pytest.approx((low, high), abs=1e-12), text
 
 
-@pytest.mark.parametrize(
-    ("text", "integral", "peak"),
-    [
-        ("5000 if t > 0.1003 and t < 0.10032 else 0", 0.1, 5000.0),
-        ("1e4 * exp(-((t - 0.25) / 1e-5) ** 2)", 0.1 * math.sqrt(math.pi), 1e4),
-        ("abs(t - 0.3)", 0.29, 0.7),
-        ("3 if t % 0.1 < 1e-4 else 0", 3e-3, 3.0),
-        ("step(sin(50 * t))", 8 * math.pi / 50, 1.0),
-        ("2 * cos(5 * t)", 0.4 * math.sin(5), 2.0),
-        ("t * t", 1 / 3, 1.0),
-    ],
-)
+@pytest.mark.parametrize(("text", "integral", "peak"), [
+    ("5000 if t > 0.1003 and t < 0.10032 else 0", 0.1, 5000.0),
+    ("1e4 * exp(-((t - 0.25) / 1e-5) ** 2)", 0.1 * math.sqrt(math.pi), 1e4),
+    ("abs(t - 0.3)", 0.29, 0.7),
+    ("3 if t % 0.1 < 1e-4 else 0", 3e-3, 3.0),
+    ("step(sin(50 * t))", 8 * math.pi / 50, 1.0),
+    ("2 * cos(5 * t)", 0.4 * math.sin(5), 2.0),
+    ("t * t", 1 / 3, 1.0),
+])  # fmt: skip
 @pytest.mark.parametrize("pause", [1.0, 0.3, 0.01])
 def test_a_pulse_between_samples_is_found(text: str, integral: float, peak: float, pause: float) -> None:
     """Over [0, 1] s, however short it is; with its peak, and the time of it."""

@@ -5,7 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from solver_state import bodies_of, scene_of
+from scenes import ball, block, body, box, scene_of, slow
+from solver_state import bodies_of
 
 from mpmcli.scene import Scene, sample_bodies
 from mpmcli.solver.engine.run import build_run
@@ -29,12 +30,7 @@ def meeting(
         time={"end": end, "frames": 4, "safety": safety},
         solver={"precision": "f64", **solver},
         bodies=[
-            {
-                "name": name,
-                "material": SOFT | {"youngs_modulus": 1e4 * factor},
-                "shape": {"ball": {"center": center, "radius": 0.2}},
-                "velocity": [speed, 0.0],
-            }
+            body(name, SOFT | {"youngs_modulus": 1e4 * factor}, ball(center, 0.2), velocity=[speed, 0.0])
             for name, center, speed, factor in balls
         ]
         + [*beside],
@@ -63,13 +59,8 @@ def test_sand_keeps_a_share_of_what_nodes_do_not_see(backend_of: Callable, part:
     Sand keeps 0.85 in a step of its own, and loses as much per second in shorter ones.
     """
     sand = {"law": "sand", "density": 1600.0, "youngs_modulus": 1e6, "friction_angle": 35.0}
-    shape = {"box": {"min": [0.2, 0.2], "max": [0.8, 0.8]}}
-    scene = scene_of(
-        domain={"size": [1.0, 1.0], "spacing": 0.1},
-        time={"end": 1.0, "frames": 1},
-        solver={"precision": "f64"},
-        bodies=[{"name": "sand", "material": sand, "shape": shape, "sampling": "lattice"}],
-    )
+    shape = box([0.2, 0.2], [0.8, 0.8])
+    scene = scene_of(body("sand", sand, shape, sampling="lattice"), size=[1.0, 1.0], spacing=0.1, precision="f64")
     sample = sample_bodies(scene)[0]
     row = np.round(sample.position / 0.05 - 0.5).astype(int)
     velocity = 1e-6 * (-1.0) ** row.sum(axis=1)[:, None] * [1.0, 0.5]
@@ -80,7 +71,7 @@ def test_sand_keeps_a_share_of_what_nodes_do_not_see(backend_of: Callable, part:
     assert after.v[middle] == pytest.approx(kept * velocity[middle], rel=1e-5)
 
 
-@pytest.mark.parametrize("solids", ["updated", pytest.param("total", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("solids", ["updated", slow("total")])
 def test_bodies_of_unequal_shares_keep_both_momenta(backend_of: Callable, solids: str) -> None:
     run = build_run(meeting(100.0, solids=solids), backend_of("f64", 1))
     rows = [row for _, row in run.frames()]
@@ -94,18 +85,12 @@ def test_bodies_of_unequal_shares_keep_both_momenta(backend_of: Callable, solids
 
 def test_deformation_bounds_a_bodys_own_step(backend_of: Callable) -> None:
     """A cell that is stretched at r = 2/s, nearly without stiffness: 0.5 / r; its speed allows twice that."""
+    soft = SOFT | {"youngs_modulus": 1e-6}
     scene = scene_of(
+        block("cell", soft, [0.5, 0.5], [0.55, 0.55], velocity=["2 * (X - 0.525)", "-2 * (Y - 0.525)"]),
         domain={"size": [1.0, 1.0], "spacing": 0.05},
-        time={"end": 1.0, "frames": 1, "step": 0.02},
-        solver={"precision": "f64"},
-        bodies=[
-            {
-                "name": "cell",
-                "material": SOFT | {"youngs_modulus": 1e-6},
-                "shape": {"box": {"min": [0.5, 0.5], "max": [0.55, 0.55]}},
-                "velocity": ["2 * (X - 0.525)", "-2 * (Y - 0.525)"],
-            }
-        ],
+        step=0.02,
+        precision="f64",
     )
     run = build_run(scene, backend_of("f64", 1))
     for _ in range(2):
@@ -126,12 +111,12 @@ def lost(scene: Scene, backend: Backend) -> float:
 
 def ringing(safety: float, **solver: object) -> Scene:
     """Return a free bar of 16 cells that rings in its first mode for five periods."""
-    bar = {"box": {"min": [0.32, 0.3], "max": [1.12, 0.5]}}
+    bar = box([0.32, 0.3], [1.12, 0.5])
     return scene_of(
+        body("bar", SOFT, bar, velocity=["0.01 * cos(pi*(X-0.32)/0.8)", 0.0]),
         domain={"size": [1.5, 0.8], "spacing": 0.05},
         time={"end": 2.2, "frames": 11, "safety": safety},
         solver={"precision": "f64", **solver},
-        bodies=[{"name": "bar", "material": SOFT, "shape": bar, "velocity": ["0.01 * cos(pi*(X-0.32)/0.8)", 0.0]}],
     )
 
 
@@ -149,10 +134,10 @@ def test_a_free_bar_loses_as_much_in_a_second_at_any_step(backend_of: Callable) 
 @pytest.mark.parametrize(
     ("solver", "end", "tolerance"),
     [
-        pytest.param({"f_bar": False}, 0.4, 0.1, marks=pytest.mark.slow),
+        slow({"f_bar": False}, 0.4, 0.1),
         ({"f_bar": True}, 0.4, 0.1),
         # At 0.4 s their springs still return energy.
-        pytest.param({"solids": "total"}, 0.8, 0.2, marks=pytest.mark.slow),
+        slow({"solids": "total"}, 0.8, 0.2),
     ],
     ids=str,
 )
@@ -166,31 +151,36 @@ def test_bodies_that_meet_lose_as_much_at_any_step(
 
 
 @pytest.mark.parametrize(
-    "name",
-    [pytest.param(f"{name}_blocks", marks=pytest.mark.slow) for name in ("metal", "paste", "snow", "sand")],
-)
-def test_plastic_flow_is_as_far_at_any_step(backend_of: Callable, name: str) -> None:
-    """The known stress of blocks in homogeneous motion, in steps of 1, 1/5 and 1/50: waves from faces disturb it."""
-    case = all_cases()[name]
-    for n in (1, 5, 50):
-        scene = scene_of_case(case, 8, Setting(safety=0.8 / n))
-        found = case.measure(8, scene, build_run(scene, backend_of("f64", 1)).frames())
-        assert max(map(abs, found.values())) < 4e-3, n
-
-
-@pytest.mark.parametrize(
-    ("name", "n", "measure", "tolerance"),
+    ("name", "n", "parts", "measures", "bound"),
     [
-        pytest.param("two_disks", 20, "energy loss", 0.05, marks=pytest.mark.slow),
-        pytest.param("conservation_contact", 16, "energy loss", 0.02, marks=pytest.mark.slow),
-        pytest.param("conservation", 8, "energy loss", 0.02, marks=pytest.mark.slow),
-        pytest.param("taylor_green", 16, "decay error", 0.05, marks=pytest.mark.slow),
-        pytest.param("dam_break", 16, "front error", 0.05, marks=pytest.mark.slow),
-        pytest.param("bar_fixed_fixed", 13, "energy loss", 0.05, marks=pytest.mark.slow),
-        pytest.param("bar_fixed_free", 13, "energy loss", 0.2, marks=pytest.mark.slow),
-        pytest.param("spinning_disc", 8, "energy loss", 0.1, marks=pytest.mark.slow),
+        *(slow(f"{name}_blocks", 8, (1, 5, 50), None, 4e-3) for name in ("metal", "paste", "snow", "sand")),
+        ("toss", 1, (1, 5), ("volume error",), 0.02),
     ],
 )
+def test_what_is_known_is_as_far_off_at_any_step(
+    backend_of: Callable, name: str, n: int, parts: tuple[int, ...], measures: tuple[str, ...] | None, bound: float
+) -> None:
+    """In steps of 1, 1/5 and 1/50: the stress of blocks in homogeneous motion, which waves from faces disturb.
+
+    Water that is thrown and falls back has its volume again; its steps of 1/50 take 10 s more.
+    """
+    case = all_cases()[name]
+    for part in parts:
+        scene = scene_of_case(case, n, Setting(safety=0.8 / part))
+        found = case.measure(n, scene, build_run(scene, backend_of("f64", 1)).frames())
+        assert max(abs(found[measure]) for measure in measures or found) < bound, part
+
+
+@pytest.mark.parametrize(("name", "n", "measure", "tolerance"), [
+    slow("two_disks", 20, "energy loss", 0.05),
+    slow("conservation_contact", 16, "energy loss", 0.02),
+    slow("conservation", 8, "energy loss", 0.02),
+    slow("taylor_green", 16, "decay error", 0.05),
+    slow("dam_break", 16, "front error", 0.05),
+    slow("bar_fixed_fixed", 13, "energy loss", 0.05),
+    slow("bar_fixed_free", 13, "energy loss", 0.2),
+    slow("spinning_disc", 8, "energy loss", 0.1),
+])  # fmt: skip
 def test_the_table_of_what_steps_lose(backend_of: Callable, name: str, n: int, measure: str, tolerance: float) -> None:
     """Of docs/theory.md, 2.3: what validation cases lose in steps of 1, 1/5 and 1/50; differences fall with h."""
     case, lost = all_cases()[name], []
@@ -202,16 +192,7 @@ def test_the_table_of_what_steps_lose(backend_of: Callable, name: str, n: int, m
 
 def test_a_stiff_bystander_takes_nothing(backend_of: Callable) -> None:
     """Two balls that meet lose as much energy beside a body at rest whose steps are a tenth as long."""
-    shape = {"box": {"min": [0.9, 1.5], "max": [1.1, 1.7]}}
-    stiff = {"name": "bystander", "material": SOFT | {"youngs_modulus": 1e6}, "shape": shape}
+    shape = box([0.9, 1.5], [1.1, 1.7])
+    stiff = body("bystander", SOFT | {"youngs_modulus": 1e6}, shape)
     backend = backend_of("f64", 1)
     assert lost(meeting(1.0, beside=[stiff]), backend) == pytest.approx(lost(meeting(1.0), backend), rel=0.1)
-
-
-def test_volumes_relax_as_far_at_any_step(backend_of: Callable) -> None:
-    """Water that is thrown and falls back has its volume again, to 2 %, in steps of 1 and 1/5; 1/50 take 10 s more."""
-    case = all_cases()["toss"]
-    for n in (1, 5):
-        scene = scene_of_case(case, 1, Setting(safety=0.8 / n))
-        found = case.measure(1, scene, build_run(scene, backend_of("f64", 1)).frames())
-        assert abs(found["volume error"]) < 0.02, n

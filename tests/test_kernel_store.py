@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 from conftest import ROOT
-from solver_state import scene_of
+from scenes import block, body, box, liquid, scene_of, solid
 
 from mpmcli.materials import fluid
 from mpmcli.scene import Scene
@@ -27,11 +27,7 @@ from mpmcli.solver.machine.backend import Backend, choose_backend, start, stop_b
 
 def drop(**tables: object) -> Scene:
     """Return the scene of a block that falls, 10 x 8 cells, of the law that compiles fastest."""
-    block = {
-        "name": "block",
-        "material": {"law": "fixed_corotated", "density": 1000.0, "youngs_modulus": 1e5},
-        "shape": {"box": {"min": [0.2, 0.3], "max": [0.5, 0.6]}},
-    }
+    block = body("block", solid(1e5, law="fixed_corotated"), box([0.2, 0.3], [0.5, 0.6]))
     usual = {
         "domain": {"size": [1.0, 0.8], "spacing": 0.1, "gravity": [0.0, -9.81]},
         "time": {"end": 0.01, "frames": 1},
@@ -196,18 +192,13 @@ def test_the_key_has_all_that_a_kernel_is_made_from(folder: Path, monkeypatch: p
     usual = key(drop())
     assert key(drop(time={"end": 2.0, "frames": 7})) == usual
     solid = {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 1e5}
-    body = {"name": "block", "material": solid, "shape": {"box": {"min": [0.2, 0.3], "max": [0.5, 0.6]}}}
+    body = block("block", solid, [0.2, 0.3], [0.5, 0.6])
     domain = {"size": [1.0, 0.8], "spacing": 0.1, "gravity": [0.0, -9.81]}
     others = [
-        key(drop(bodies=[body])),
-        key(drop(domain={**domain, "walls": "stick"})),
-        key(drop(domain={**domain, "spacing": 0.01})),
-        key(drop(solver={"transfer": "aflip"})),
-        key(drop(), threads=2),
-        key(drop(), runs=2),
-        key(drop(), before=1),
-        key(drop(), sources="another"),
-    ]
+        key(drop(bodies=[body])), key(drop(domain={**domain, "walls": "stick"})),
+        key(drop(domain={**domain, "spacing": 0.01})), key(drop(solver={"transfer": "aflip"})), key(drop(), threads=2),
+        key(drop(), runs=2), key(drop(), before=1), key(drop(), sources="another"),
+    ]  # fmt: skip
     with monkeypatch.context() as patch:
         patch.setattr(kernel_store, "_machine", lambda: "another")
         others.append(key(drop()))
@@ -222,7 +213,7 @@ def test_edited_sources_compile_what_they_change(folder: Path, monkeypatch: pyte
 
     Sources that return find theirs, and of two kernels of one name the one in use is linked.
     """
-    material = {"law": "fluid", "density": 1000.0, "bulk_modulus": 1e5, "exponent": 7.0}
+    material = liquid(1e5, exponent=7.0)
     block = drop().bodies[0].model_dump(include={"name", "shape"})
     time_of = {"end": 0.02, "frames": 1}  # Longer than a step with either constant.
     scene = drop(bodies=[block | {"material": material}], solver={"redistribute": False}, time=time_of)

@@ -5,7 +5,8 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from solver_state import bodies_of, scene_of
+from scenes import block, scene_of, solid
+from solver_state import bodies_of
 from test_solver_conservation import free_scene
 
 from mpmcli.check.scene_limits import scene_limits
@@ -25,16 +26,9 @@ H = 0.1
 def small_scene(**knobs: object) -> Scene:
     """Return a block of jelly on the floor of a box."""
     return scene_of(
+        block("block", solid(1e5), [3 * H, 0.0], [7 * H, 4 * H]),
         domain={"size": [11 * H, 9 * H], "spacing": H, "gravity": [0.0, -9.81]},
-        time={"end": 1.0, "frames": 1},
         solver=knobs,
-        bodies=[
-            {
-                "name": "block",
-                "material": {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 1e5},
-                "shape": {"box": {"min": [3 * H, 0.0], "max": [7 * H, 4 * H]}},
-            }
-        ],
     )
 
 
@@ -60,10 +54,7 @@ def test_flip_belongs_to_aflip() -> None:
         small_scene(transfer="aflip", flip=1.5)
 
 
-@pytest.mark.parametrize(
-    ("key", "value", "right"),
-    [("kernel", "linear", "cubic"), ("transfer", "flip", "aflip")],
-)
+@pytest.mark.parametrize(("key", "value", "right"), [("kernel", "linear", "cubic"), ("transfer", "flip", "aflip")])
 def test_other_words_are_refused(key: str, value: str, right: str) -> None:
     with pytest.raises(InputError, match=rf"solver\.{key}.*{right}"):
         small_scene(**{key: value})
@@ -76,9 +67,7 @@ def test_the_effective_scene_says_every_knob() -> None:
 
 
 @pytest.mark.parametrize(
-    "knobs",
-    [{}, {"kernel": "cubic"}, {"transfer": "aflip"}],
-    ids=lambda knobs: "-".join(knobs.values()) or "usual",
+    "knobs", [{}, {"kernel": "cubic"}, {"transfer": "aflip"}], ids=lambda knobs: "-".join(knobs.values()) or "usual"
 )
 def test_the_plan_follows_the_knobs(backend_of: Callable, knobs: dict) -> None:
     """Nodes, their bytes and the passes, counted from the solver's own fields."""
@@ -148,17 +137,10 @@ def test_what_bodies_keep_takes_neither_momentum(backend_of: Callable, knobs: di
 def pulled(acceleration: object, gravity: float = 0.0, **knobs: object) -> Scene:
     """Return a free block of soft jelly that a force pulls along y, and gravity along x; all such have a kernel."""
     return scene_of(
+        block("block", solid(1e3), [3 * H, 3 * H], [7 * H, 7 * H]),
         domain={"size": [11 * H, 11 * H], "spacing": H, "gravity": [gravity, 0.0]},
-        time={"end": 1.0, "frames": 1},
         solver={"transfer": "aflip", "precision": "f64", **knobs},
         forces=[{"acceleration": [0.0, acceleration]}],
-        bodies=[
-            {
-                "name": "block",
-                "material": {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 1e3},
-                "shape": {"box": {"min": [3 * H, 3 * H], "max": [7 * H, 7 * H]}},
-            }
-        ],
     )
 
 

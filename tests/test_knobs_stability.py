@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from blow_up.scenes import alone, block, liquid, solid
 from blow_up.trial import Trial
+from scenes import slow
 from step_spectrum import Choice, Coupling, free, periodic, radius, step_matrix
 
 from mpmcli.scene.schema import SolverSettings
@@ -81,14 +82,7 @@ def test_a_wave_loses_what_check_says(knobs: dict) -> None:
         assert lost == pytest.approx(loss_per_step(SolverSettings(**knobs), k), rel=0.03, abs=1e-3 * k**4)
 
 
-@pytest.mark.parametrize(
-    "knobs",
-    [
-        {"kernel": "cubic"},
-        pytest.param({"transfer": "aflip", "flip": 1.0}, marks=pytest.mark.slow),
-    ],
-    ids=name_of,
-)
+@pytest.mark.parametrize("knobs", [{"kernel": "cubic"}, slow({"transfer": "aflip", "flip": 1.0})], ids=name_of)
 def test_a_lone_particle_blows_up_at_the_bound(backend_of: Callable, knobs: dict) -> None:
     """The solver's own steps, at 0.98 and 1.02 of what it allows."""
     scene = alone("fluid", liquid(), 2, stretches=(1 + 1e-6,) * 2)

@@ -2,28 +2,20 @@
 
 from collections.abc import Callable
 
-import mpm_reference as reference
 import numpy as np
 import path_run
 import pytest
-from path_reference import Arrays, check_nodes, reference_groups
-from rounding import OF_A_STEP
+from path_reference import TOLERANCE, check_steps
+from scenes import slow
 
 from mpmcli.errors import InputError
 from mpmcli.scene import Scene
 from mpmcli.scene.schema import SolverSettings
 from mpmcli.solver.engine.run import Run, build_run
 from mpmcli.solver.machine.backend import Backend
-from mpmcli.solver.transfer.splines import PAD
 
-# As in test_solver_paths.
-TOLERANCE = {"f32": OF_A_STEP, "f64": 1e-12}
 CUBIC = {"kernel": "cubic"}
 AFLIP = {"transfer": "aflip", "flip": 0.9}
-
-
-def slowly(*parameters: object) -> object:
-    return pytest.param(*parameters, marks=pytest.mark.slow)
 
 
 def name_of(choice: object) -> str:
@@ -44,42 +36,9 @@ def prepare(scene: Scene, backend: Backend) -> Run:
     return run
 
 
-def check_steps(scene: Scene, arrays: Arrays, tolerance: float) -> None:
-    """Compare the nodes and the particles of every recorded step with the reference."""
-    box = reference.Box(
-        scene.domain.cells,
-        scene.domain.spacing,
-        np.array(scene.domain.gravity),
-        scene.domain.walls.faces(scene.dimension),
-        kernel=scene.solver.kernel,
-    )
-    laws = sorted({body.material.law for body in scene.bodies})
-    inside = tuple(slice(PAD - reference.MARGIN, PAD + n + 1 + reference.MARGIN) for n in box.cells)
-    for k in range(path_run.RECORDED):
-        groups = reference_groups(scene, arrays, k)
-        kick = path_run.STEP * (0.5 if k == 0 else 1.0)
-        momentum, mass = reference.scatter(groups, box, kick)
-        before = reference.scatter_kept(groups, box)
-        velocity, velocity_before = reference.update_both(momentum, mass, *before, box, kick)
-        expected = reference.gather(groups, velocity, box, path_run.STEP, velocity_before, kick)
-        fastest = np.abs(velocity).max()
-        for law, group in zip(laws, expected, strict=True):
-            scales = {"x": group.x.max(), "v": fastest, "C": 4 / box.spacing * fastest, "deformation": 1.0}
-            for name, scale in scales.items():
-                error = np.abs(arrays[f"{k + 1}_{law}_{name}"] - getattr(group, name)).max() / scale
-                assert error < tolerance, f"step {k}, {law} {name}: {error:.2e}"
-        check_nodes(arrays[f"{k}_nodes"][inside], momentum, mass, velocity, kick * box.gravity, tolerance)
-
-
 @pytest.mark.parametrize(
     ("dimension", "knobs"),
-    [
-        (2, AFLIP),
-        slowly(2, CUBIC),
-        slowly(2, AFLIP | CUBIC),
-        slowly(3, CUBIC),
-        slowly(3, AFLIP | CUBIC),
-    ],
+    [(2, AFLIP), slow(2, CUBIC), slow(2, AFLIP | CUBIC), slow(3, CUBIC), slow(3, AFLIP | CUBIC)],
     ids=name_of,
 )
 def test_steps_match_plain_numpy(backend_of: Callable, dimension: int, knobs: dict) -> None:
@@ -89,7 +48,7 @@ def test_steps_match_plain_numpy(backend_of: Callable, dimension: int, knobs: di
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize(("dimension", "knobs"), [(2, AFLIP | CUBIC), slowly(3, CUBIC)], ids=name_of)
+@pytest.mark.parametrize(("dimension", "knobs"), [(2, AFLIP | CUBIC), slow(3, CUBIC)], ids=name_of)
 def test_steps_of_a_gpu_match_plain_numpy(backend_of: Callable, dimension: int, knobs: dict) -> None:
     try:
         backend = backend_of("f32", 1, "vulkan")
@@ -100,7 +59,7 @@ def test_steps_of_a_gpu_match_plain_numpy(backend_of: Callable, dimension: int, 
 
 
 @pytest.mark.parametrize(
-    ("dimension", "knobs"), [slowly(2, CUBIC), slowly(2, AFLIP | CUBIC), slowly(3, AFLIP | CUBIC)], ids=name_of
+    ("dimension", "knobs"), [slow(2, CUBIC), slow(2, AFLIP | CUBIC), slow(3, AFLIP | CUBIC)], ids=name_of
 )
 def test_bitwise_equal_for_any_number_of_threads(backend_of: Callable, dimension: int, knobs: dict) -> None:
     """State after 150 steps and many sorts: the tiles of a wider stencil are as disjoint when their colours run."""

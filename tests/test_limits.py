@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from solver_state import bodies_of, scene_of
+from scenes import body, box, liquid, scene_of, slow, solid
+from solver_state import bodies_of
 
 from mpmcli.scene import sample_bodies
 from mpmcli.solver.engine.run import Run, build_run
@@ -30,37 +31,14 @@ def lone_particles(dimension: int) -> object:
 
     def cell(x: float) -> dict:
         low = [x] + [0.33] * (d - 1)
-        return {"box": {"min": low, "max": [c + H for c in low]}}
+        return box(low, [c + H for c in low])
 
     return scene_of(
+        body("solid", solid(E, density=RHO, poissons_ratio=NU), cell(0.32), **side),
+        # With the cut-off half of its oscillation would be free.
+        body("liquid", liquid(LAMBDA + 2 * MU / d, density=RHO, tension_cutoff=False), cell(1.07), **side),
         domain={"size": [1.6] + [0.8] * (d - 1), "spacing": H},
-        time={"end": 1.0, "frames": 1},
-        solver={"precision": "f64"},
-        bodies=[
-            {
-                "name": "solid",
-                "material": {
-                    "law": "neo_hookean",
-                    "density": RHO,
-                    "youngs_modulus": E,
-                    "poissons_ratio": NU,
-                },
-                "shape": cell(0.32),
-                **side,
-            },
-            {
-                "name": "liquid",
-                # With the cut-off half of its oscillation would be free.
-                "material": {
-                    "law": "fluid",
-                    "density": RHO,
-                    "bulk_modulus": LAMBDA + 2 * MU / d,
-                    "tension_cutoff": False,
-                },
-                "shape": cell(1.07),
-                **side,
-            },
-        ],
+        precision="f64",
     )
 
 
@@ -78,15 +56,7 @@ def predicted(dimension: int) -> float:
     return H / np.sqrt((dimension * LAMBDA + 2 * MU) / RHO)
 
 
-@pytest.mark.parametrize(
-    ("dimension", "steps"),
-    [
-        (2, 10_000),
-        pytest.param(3, 10_000, marks=pytest.mark.slow),
-        pytest.param(2, 100_000, marks=pytest.mark.slow),
-        pytest.param(3, 100_000, marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.parametrize(("dimension", "steps"), [(2, 10_000), slow(3, 10_000), slow(2, 100_000), slow(3, 100_000)])
 def test_a_lone_particle_is_stable_just_below_its_limit(
     backend_of: Callable, dimension: int, steps: int, record_property: Callable
 ) -> None:
@@ -111,7 +81,7 @@ def test_a_lone_particle_is_stable_just_below_its_limit(
         assert START / 2 < value < 1.05 * START / np.sqrt(1 - 0.98**2)
 
 
-@pytest.mark.parametrize("dimension", [2, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("dimension", [2, slow(3)])
 def test_a_lone_particle_grows_just_above_its_limit(
     backend_of: Callable, dimension: int, record_property: Callable
 ) -> None:
@@ -123,11 +93,11 @@ def test_a_lone_particle_grows_just_above_its_limit(
     # Within these the state stays far inside the linear range: 1e-6 x 1.49^25 dt = 1e-4.
     for _ in range(25 - n):
         run.step(r * predicted(dimension))
-    middle = {name: float(np.abs(body.C).max()) for name, body in bodies_of(run).items()}
+    middle = {name: float(np.abs(state.C).max()) for name, state in bodies_of(run).items()}
     for _ in range(n):
         run.step(r * predicted(dimension))
-    for name, body in bodies_of(run).items():
-        largest = float(np.abs(body.C).max())
+    for name, state in bodies_of(run).items():
+        largest = float(np.abs(state.C).max())
         record_property(f"{name} growth/step", (largest / middle[name]) ** (1 / n))
         assert largest > 1e3 * START
         assert (largest / middle[name]) ** (1 / n) == pytest.approx(growth, rel=0.01)

@@ -5,21 +5,17 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from lone_particles import Outcome, let_go
+from scenes import liquid, solid
 
 from mpmcli.check.result_check import ENERGY_SUSPECT, energy_change
 
 MATERIALS = {
-    "fluid": {"law": "fluid", "density": 1000.0, "bulk_modulus": 1e5},
-    "fluid with tension": {"law": "fluid", "density": 1000.0, "bulk_modulus": 1e5, "tension_cutoff": False},
-    "neo_hookean": {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 1e5},
-    "neo_hookean, 0.45": {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 1e5, "poissons_ratio": 0.45},
-    "fixed_corotated": {"law": "fixed_corotated", "density": 1000.0, "youngs_modulus": 1e5},
-    "fixed_corotated, 0.45": {
-        "law": "fixed_corotated",
-        "density": 1000.0,
-        "youngs_modulus": 1e5,
-        "poissons_ratio": 0.45,
-    },
+    "fluid": liquid(1e5),
+    "fluid with tension": liquid(1e5, tension_cutoff=False),
+    "neo_hookean": solid(1e5),
+    "neo_hookean, 0.45": solid(1e5, poissons_ratio=0.45),
+    "fixed_corotated": solid(1e5, law="fixed_corotated"),
+    "fixed_corotated, 0.45": solid(1e5, law="fixed_corotated", poissons_ratio=0.45),
     "von_mises": {"law": "von_mises", "density": 1000.0, "youngs_modulus": 1e5, "yield_stress": 1e4},
     "sand": {"law": "sand", "density": 1000.0, "youngs_modulus": 1e5, "friction_angle": 30.0, "cohesion": 5e3},
     "snow": {"law": "snow", "density": 1000.0, "youngs_modulus": 1.4e5},

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from law_probe import LawProbe, Probes, Response, assert_finite, rotations, stretched
 from law_tangent import largest_stiffness
-from solver_state import scene_of
+from scenes import block, scene_of
 
 from mpmcli.materials.law import StateBound
 from mpmcli.materials.registry import laws, parameter_models
@@ -37,13 +37,7 @@ class Case:
 CASES = {
     "fluid": Case({"bulk_modulus": 2e5, "exponent": 7.0, "tension_cutoff": False}, 2e5),
     "viscoplastic": Case(
-        {
-            "bulk_modulus": 2e5,
-            "shear_modulus": 5e4,
-            "yield_stress": 1e3,
-            "consistency": 5.0,
-            "tension_cutoff": False,
-        },
+        {"bulk_modulus": 2e5, "shear_modulus": 5e4, "yield_stress": 1e3, "consistency": 5.0, "tension_cutoff": False},
         2e5,
         5e-3,
         plane=False,
@@ -360,14 +354,7 @@ def test_fluid_chooses_the_softest_modulus_that_is_stiff_enough() -> None:
 def test_scene_resolves_the_modulus() -> None:
     """A loaded scene holds the number, and an effective scene never says "auto"."""
     scene = scene_of(
+        block("water", {"law": "fluid", "density": 1000.0}, [0.0, 0.0], [1.0, 1.0]),
         domain={"size": [2.0, 2.0], "spacing": 0.1, "gravity": [0.0, -9.81]},
-        time={"end": 1.0, "frames": 1},
-        bodies=[
-            {
-                "name": "water",
-                "material": {"law": "fluid", "density": 1000.0},
-                "shape": {"box": {"min": [0.0, 0.0], "max": [1.0, 1.0]}},
-            }
-        ],
     )
     assert scene.bodies[0].material.bulk_modulus == pytest.approx(1.962e6)

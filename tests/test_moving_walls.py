@@ -4,7 +4,8 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from solver_state import bodies_of, scene_of
+from scenes import block, scene_of, slow
+from solver_state import bodies_of
 
 from mpmcli.scene import Scene
 from mpmcli.solver.engine.run import build_run
@@ -28,6 +29,7 @@ def pressed_block(name: str, speed: float) -> Scene:
     word, friction, settings = BLOCKS[name]
     velocity = {} if speed == 0 else {"wall_velocity": {"y_min": [speed, 0.0]}}
     return scene_of(
+        block("block", SOLID, [4 * H, 0.0], [9 * H, 4 * H], velocity=[speed + 1.0, -0.8]),
         domain={
             "size": [16 * H] * 2,
             "spacing": H,
@@ -36,22 +38,12 @@ def pressed_block(name: str, speed: float) -> Scene:
         }
         | velocity
         | ({"friction": {"y_min": friction}} if friction else {}),
-        time={"end": 1.0, "frames": 4},
+        frames=4,
         solver={"precision": "f64"} | settings,
-        bodies=[
-            {
-                "name": "block",
-                "material": SOLID,
-                "shape": {"box": {"min": [4 * H, 0.0], "max": [9 * H, 4 * H]}},
-                "velocity": [speed + 1.0, -0.8],
-            }
-        ],
     )
 
 
-@pytest.mark.parametrize(
-    "name", [name if name == "rough, aflip" else pytest.param(name, marks=pytest.mark.slow) for name in BLOCKS]
-)
+@pytest.mark.parametrize("name", [name if name == "rough, aflip" else slow(name) for name in BLOCKS])
 def test_a_moving_wall_is_one_at_rest_in_its_own_frame(
     backend_of: Callable, name: str, record_property: Callable
 ) -> None:
@@ -75,7 +67,7 @@ def test_a_moving_wall_is_one_at_rest_in_its_own_frame(
     assert largest < 1e-10
 
 
-@pytest.mark.parametrize("solids", ["updated", pytest.param("total", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("solids", ["updated", slow("total")])
 def test_a_rough_wall_drags_a_block_along(backend_of: Callable, solids: str, record_property: Callable) -> None:
     """Its momentum grows by mu M g per second until it moves with the wall, to 1 %, and stays there.
 
@@ -85,24 +77,13 @@ def test_a_rough_wall_drags_a_block_along(backend_of: Callable, solids: str, rec
     # On its way it leaves through the face along x, unless there is a wall.
     left = 0.25 if solids == "total" else 1.0
     scene = scene_of(
-        domain={
-            "size": [2.0, 1.0],
-            "cells": [16, 8],
-            "gravity": [0.0, -g],
-            "walls": {"default": "separate"}
-            | ({} if solids == "total" else {"x_min": "periodic", "x_max": "periodic"}),
-            "friction": {"y_min": friction},
-            "wall_velocity": {"y_min": [speed, 0.0]},
-        },
+        block("block", SOLID | {"youngs_modulus": 1e7, "poissons_ratio": 0.0}, [left, 0.0], [left + 0.75, 0.375]),
+        domain={"size": [2.0, 1.0], "cells": [16, 8], "gravity": [0.0, -g]},
+        walls={"default": "separate"} | ({} if solids == "total" else {"x_min": "periodic", "x_max": "periodic"}),
+        friction={"y_min": friction},
+        wall_velocity={"y_min": [speed, 0.0]},
         time={"end": 0.6, "frames": 12},
-        solver={"solids": solids},
-        bodies=[
-            {
-                "name": "block",
-                "material": SOLID | {"youngs_modulus": 1e7, "poissons_ratio": 0.0},
-                "shape": {"box": {"min": [left, 0.0], "max": [left + 0.75, 0.375]}},
-            }
-        ],
+        solids=solids,
     )
     rows = [row for _, row in build_run(scene, backend_of("f32")).frames()]
     found = np.array([row.linear_momentum[0] / row.mass for row in rows])

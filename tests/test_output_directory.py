@@ -158,13 +158,7 @@ def test_the_record_of_a_run(tmp_path):
     assert ended["limits"] == {make_row(1, 2).limit: 1, make_row(2, 2).limit: 1}
     assert ended["energy"]["first"] == make_row(0, 2).energy
     assert ended["energy"]["last"] == make_row(2, 2).energy
-    assert ended["failure"] == {
-        "message": "It blew up.",
-        "step": 21,
-        "time": 0.25,
-        "particle": 7,
-        "speed": None,
-    }
+    assert ended["failure"] == {"message": "It blew up.", "step": 21, "time": 0.25, "particle": 7, "speed": None}
     assert set(ended["host"]) == {"python", "taichi", "system", "machine", "cpu_count"}
     assert "directory" not in ended and os.listdir(tmp_path) == ["run.json"]
 

@@ -11,13 +11,9 @@ from mpmcli.output.layout import FrameLayout, ledger_columns, ledger_rows
 
 # Fields by name: shape per particle as a function of d.
 FIELDS = {
-    "density": lambda d: (),
-    "pressure": lambda d: (),
-    "acceleration": lambda d: (d,),
-    "deformation_gradient": lambda d: (d, d),
-    "stress": lambda d: (d * d,),
-    "five": lambda d: (5,),
-}
+    "density": lambda d: (), "pressure": lambda d: (), "acceleration": lambda d: (d,),
+    "deformation_gradient": lambda d: (d, d), "stress": lambda d: (d * d,), "five": lambda d: (5,),
+}  # fmt: skip
 
 
 def make_frame(index: int, n: int, d: int, dtype: str = "float32", fields=("density", "pressure")) -> Frame:
@@ -86,18 +82,11 @@ def test_a_plane_deformation_gradient_is_padded_to_plane_strain():
     assert stored["stress"][0].tolist() == [1, 2, 0, 3, 4, 0, 0, 0, 0]
 
 
-@pytest.mark.parametrize(
-    "fields",
-    [
-        {"a.b": np.zeros(4, np.float32)},
-        {"a/b": np.zeros(4, np.float32)},
-        {"velocity": np.zeros((4, 2), np.float32)},
-        {"flag": np.zeros(4, bool)},
-        {"half": np.zeros(4, np.float16)},
-        {"short": np.zeros(3, np.float32)},
-        {"cube": np.zeros((4, 2, 3), np.float32)},
-    ],
-)
+@pytest.mark.parametrize("fields", [
+    {"a.b": np.zeros(4, np.float32)}, {"a/b": np.zeros(4, np.float32)}, {"velocity": np.zeros((4, 2), np.float32)},
+    {"flag": np.zeros(4, bool)}, {"half": np.zeros(4, np.float16)}, {"short": np.zeros(3, np.float32)},
+    {"cube": np.zeros((4, 2, 3), np.float32)},
+])  # fmt: skip
 def test_arrays_that_a_file_cannot_hold_are_refused(fields):
     with pytest.raises(ValueError, match=next(iter(fields))):
         FrameLayout.of(Frame(**{**vars(make_frame(0, 4, 2)), "fields": fields}))

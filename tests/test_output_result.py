@@ -64,8 +64,8 @@ def test_a_header_of_another_version_is_read():
     made = made_header(2)
     plain = RunHeader.read(made)
     assert (plain.faces, plain.sticking, plain.shifts, plain.keeps_spin, plain.drops) == ((), None, False, True, False)
-    more = '[domain]\nolder = 1\nwalls = {y_min = "stick"}\nfriction = {x_max = 0.5}\n[solver]\ntransfer = "older"\n'
-    other = RunHeader.read({**made, "older": 2, "scene": made["scene"].replace("[domain]\n", more + "[older]\n")})
+    more = 'domain = { older = 1, walls = {y_min = "stick"}, friction = {x_max = 0.5} }\nsolver.transfer = "older"\n'
+    other = RunHeader.read({**made, "older": 2, "scene": made["scene"].replace("domain = {", more + "older = {")})
     assert other.faces == (("separate", "separate"), ("stick", "separate")) and other.sticking == (True, True)
     assert (other.keeps_spin, other.gravity, other.friction.x_max) == (False, None, 0.5)
     timed = made["scene"].replace("-9.81", '"-9.81 * t"')

@@ -29,12 +29,7 @@ from mpmcli.output import store as store_module
 from mpmcli.output.directory import take_directory
 from mpmcli.output.layout import FrameLayout, sealed_segments
 
-HEADER = {
-    "dimension": 2,
-    "bodies": ["column"],
-    "precision": "f32",
-    "scene": 'title = "é"\n',
-}
+HEADER = {"dimension": 2, "bodies": ["column"], "precision": "f32", "scene": 'title = "é"\n'}
 Usage = namedtuple("Usage", "total used free")
 
 

@@ -9,7 +9,6 @@ from elastic_bodies import DENSITY, E, bars, stirred
 
 from mpmcli.scene import sample_bodies
 from mpmcli.solver.engine.run import build_run
-from mpmcli.solver.machine.backend import Backend
 
 
 @pytest.mark.parametrize("shift", [0.0, pytest.param(0.25, marks=pytest.mark.slow)])
@@ -71,18 +70,3 @@ def test_particles_of_two_bodies_push_as_the_formula_says(backend_of: Callable) 
     assert np.abs(total).max() < 1e-9 * np.abs(impulse).sum()
     own = before["body"][order] == 0
     assert np.allclose((near - far)[own].sum(axis=0), impulse[order][own].sum(axis=0), rtol=1e-9)
-
-
-def small_run(backend: Backend) -> tuple[np.ndarray, list]:
-    """Return the last positions, and the ledger, of two bars that meet."""
-    scene = bars(16, 0.25, precision=backend.precision, frames=5)
-    found = list(build_run(scene, backend).frames())
-    return found[-1][0].position, [row for _, row in found]
-
-
-@pytest.mark.slow
-def test_threads_change_no_byte(backend_of: Callable) -> None:
-    expected, rows = small_run(backend_of("f32", 1))
-    found, own = small_run(backend_of("f32", 3))
-    assert found.tobytes() == expected.tobytes()
-    assert own == rows

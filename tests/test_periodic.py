@@ -5,7 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from solver_state import BodyState, bodies_of, scene_of
+from scenes import block, body, scene_of, slow
+from solver_state import BodyState, bodies_of
 
 from mpmcli.scene import BodyParticles, Scene, sample_bodies
 from mpmcli.solver.engine.run import build_run
@@ -30,20 +31,13 @@ def ball(name: str, dimension: int = 2, walls: object = "periodic", **more: dict
     """Return a ball that spins and flies in the middle of a box whose faces are all periodic."""
     material, tables = BALLS[name]
     d, spin = dimension, [[0.0, -3.0, 0.0], [3.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
+    motion = {"velocity": [0.9, 0.4, -0.3][:d], "velocity_gradient": [row[:d] for row in spin[:d]]}
     return scene_of(
+        body("ball", material, {"ball": {"center": [8 * H] * d, "radius": 3.3 * H}}, **motion),
         domain={"size": [16 * H] * d, "spacing": H, "walls": walls} | more.get("domain", {}),
-        time={"end": 1.0, "frames": 4},
+        frames=4,
         solver={"precision": "f64"} | tables.get("solver", {}) | more.get("solver", {}),
         forces=tables.get("forces", []),
-        bodies=[
-            {
-                "name": "ball",
-                "material": material,
-                "shape": {"ball": {"center": [8 * H] * d, "radius": 3.3 * H}},
-                "velocity": [0.9, 0.4, -0.3][:d],
-                "velocity_gradient": [row[:d] for row in spin[:d]],
-            }
-        ],
     )
 
 
@@ -72,9 +66,7 @@ def apart(scene: Scene, first: BodyState, second: BodyState, cells: tuple[int, .
     )
 
 
-@pytest.mark.parametrize(
-    "name", [name if k == 0 else pytest.param(name, marks=pytest.mark.slow) for k, name in enumerate(BALLS)]
-)
+@pytest.mark.parametrize("name", [name if k == 0 else slow(name) for k, name in enumerate(BALLS)])
 def test_a_ball_across_the_faces_is_as_one_inside(backend_of: Callable, name: str, record_property: Callable) -> None:
     """A ball that begins in the corner, half of it at each of four faces, moves as one in the middle, to round-off.
 
@@ -113,7 +105,7 @@ def dyadic(cells: tuple[int, ...]) -> tuple[Scene, list[BodyParticles]]:
     return scene, [replace(body, position=(position + H * np.array(cells)) % (16 * H))]
 
 
-@pytest.mark.parametrize("cells", [(13, 9), *(pytest.param(c, marks=pytest.mark.slow) for c in ((1, 0), (8, 5)))])
+@pytest.mark.parametrize("cells", [(13, 9), *(slow(c) for c in ((1, 0), (8, 5)))])
 def test_a_translated_scene_is_bitwise_the_translated_scene(backend_of: Callable, cells: tuple[int, int]) -> None:
     """Where sums and positions round nothing, as in the first step of such a body: no bit depends on the faces.
 
@@ -135,17 +127,10 @@ def test_a_translated_scene_is_bitwise_the_translated_scene(backend_of: Callable
 def test_a_uniform_flow_stays_uniform(backend_of: Callable, precision: str, record_property: Callable) -> None:
     """A fluid that fills the domain flows for ten lengths of it: no force anywhere."""
     scene = scene_of(
+        block("fluid", LIQUID, [0.0, 0.0], [1.0, 1.0], velocity=[1.0, -0.5]),
         domain={"size": [1.0, 1.0], "cells": [8, 8], "walls": "periodic"},
         time={"end": 10.0, "frames": 2},
-        solver={"precision": precision},
-        bodies=[
-            {
-                "name": "fluid",
-                "material": LIQUID,
-                "shape": {"box": {"min": [0.0, 0.0], "max": [1.0, 1.0]}},
-                "velocity": [1.0, -0.5],
-            }
-        ],
+        precision=precision,
     )
     rows = list(build_run(scene, backend_of(precision)).frames())
     (first, _), *_, (last, row) = rows
@@ -192,23 +177,14 @@ def poiseuille(y: np.ndarray, time: float) -> np.ndarray:
 def test_poiseuille(backend_of: Callable, record_property: Callable) -> None:
     """Gravity along a periodic channel starts the flow of the series, to second order."""
     backend, errors = backend_of("f64"), []
+    thick = LIQUID | {"density": 1000.0, "bulk_modulus": 1e5, "viscosity": 1000.0}
     for n in (8, 16):
         scene = scene_of(
-            domain={
-                "size": [8 / n, 1.0],
-                "cells": [8, n],
-                "gravity": [0.5, 0.0],
-                "walls": {"default": "stick", "x_min": "periodic", "x_max": "periodic"},
-            },
-            time={"end": 0.15, "frames": 1},
-            solver={"precision": "f64"},
-            bodies=[
-                {
-                    "name": "fluid",
-                    "material": LIQUID | {"density": 1000.0, "bulk_modulus": 1e5, "viscosity": 1000.0},
-                    "shape": {"box": {"min": [0.0, 0.0], "max": [8 / n, 1.0]}},
-                }
-            ],
+            block("fluid", thick, [0.0, 0.0], [8 / n, 1.0]),
+            domain={"size": [8 / n, 1.0], "cells": [8, n], "gravity": [0.5, 0.0]},
+            walls={"default": "stick", "x_min": "periodic", "x_max": "periodic"},
+            end=0.15,
+            precision="f64",
         )
         *_, (frame, row) = build_run(scene, backend).frames()
         exact = poiseuille(frame.position[:, 1], row.time - row.step_max / 2)

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from check_scenes import forms_of
 from command import CONFIGS, run_here
-from scenes import volume_errors
-from solver_state import scene_of
+from scenes import ball, body, box, scene_of, volume_errors
 
 from mpmcli.check.facts import arrivals
 from mpmcli.check.geometry import close_pairs
@@ -23,17 +22,9 @@ def two_balls(gravity: tuple[float, float] = (0.0, 0.0), speed: float = 1.0, **d
     places = {"flying": ([1.6, 0.5], [speed, 0.0]), "resting": ([0.2, 0.5], [0.0, 0.0])}
     walls = {"default": "stick", "x_min": "periodic", "x_max": "periodic"}
     return scene_of(
+        *(body(name, JELLY, ball(center, 0.1), velocity=velocity) for name, (center, velocity) in places.items()),
         domain={"size": [2.0, 1.0], "spacing": 0.05, "gravity": list(gravity), "walls": walls} | domain,
-        time={"end": 2.0, "frames": 1},
-        bodies=[
-            {
-                "name": name,
-                "material": JELLY,
-                "shape": {"ball": {"center": center, "radius": 0.1}},
-                "velocity": velocity,
-            }
-            for name, (center, velocity) in places.items()
-        ],
+        end=2.0,
     )
 
 
@@ -65,11 +56,11 @@ def test_nothing_falls_onto_a_periodic_face() -> None:
 )
 def test_a_layer_that_sticks_is_no_faster_than_its_weight_shears_it(material: dict, speed: float) -> None:
     """rho g H^2 / mu at most, to the spacing of the rates; a paste below its yield stress rests; else gravity t."""
-    shape = {"box": {"min": [0.0, 0.0], "max": [2.0, 0.5]}}
-    film = {"name": "film", "material": material | {"density": 1000.0}, "shape": shape}
+    shape = box([0.0, 0.0], [2.0, 0.5])
+    film = body("film", material | {"density": 1000.0}, shape)
     walls = {"x_min": "periodic", "x_max": "periodic", "y_min": "stick"}
     domain = {"size": [2.0, 1.0], "spacing": 0.05, "gravity": [3.0, 0.0], "walls": walls}
-    found = scene_bounds(scene_of(domain=domain, time={"end": 20.0, "frames": 1}, bodies=[film])).speed
+    found = scene_bounds(scene_of(film, domain=domain, end=20.0)).speed
     assert speed <= found <= 1.3 * speed
 
 

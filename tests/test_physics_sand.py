@@ -8,8 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import GRAVITY, block, scene
-from solver_state import scene_of
+from scenes import GRAVITY, block, body, collider, plane, polygon, scene, scene_of
 
 from mpmcli.scene import BodyParticles, Scene, sample_bodies
 from mpmcli.solver.engine.run import build_run
@@ -136,7 +135,7 @@ def test_a_heap_stays_on_a_rough_floor_in_short_steps(backend_of: Callable, reco
     cells, h = 6, H / 8
     half = cells * h / np.tan(np.radians(22))
     corners = [[h, 0.0], [h + 2 * half, 0.0], [h + half, cells * h]]
-    heap = {"name": "heap", "material": SAND_35, "shape": {"polygon": {"vertices": corners}}}
+    heap = body("heap", SAND_35, polygon(corners))
     asked = scene([32, 9], h, [heap], 0.3, frames=2, gravity=[0, -GRAVITY], friction=0.5)
     asked = asked.model_copy(update={"time": asked.time.model_copy(update={"safety": 0.08})})
     first, *_, last = (frame.position.astype(np.float64) for frame, _ in build_run(asked, backend_of("f32")).frames())
@@ -172,21 +171,14 @@ def test_sand_under_a_lid_shears_steadily(backend_of: Callable, record_property:
     """
     h = 0.3 / 24
     asked = scene_of(
-        domain={
-            "size": [48 * h, 36 * h],
-            "spacing": h,
-            "gravity": [0.0, -GRAVITY],
-            "walls": {"x_min": "periodic", "x_max": "periodic", "y_min": "stick"},
-        },
+        block("sand", SAND_35, [0, 0], [48 * h, 24 * h]),
+        domain={"size": [48 * h, 36 * h], "spacing": h, "gravity": [0.0, -GRAVITY]},
+        walls={"x_min": "periodic", "x_max": "periodic", "y_min": "stick"},
         time={"end": 0.6, "frames": 60},
-        bodies=[block("sand", SAND_35, [0, 0], [48 * h, 24 * h])],
         colliders=[
-            {
-                "name": "lid",
-                "wall": "stick",
-                "shape": {"plane": {"point": [0.0, 24 * h], "normal": [0.0, -1.0]}},
-                "offset": ["0.2 * t", "-0.003 * min(t / 0.2, 1)"],
-            }
+            collider(
+                "lid", plane([0.0, 24 * h], [0.0, -1.0]), wall="stick", offset=["0.2 * t", "-0.003 * min(t / 0.2, 1)"]
+            )
         ],
     )
     frames = [pair for pair in build_run(asked, backend_of("f32")).frames() if pair[0].time > 0.4]

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from good_scene import refusal
 from rounding import farthest
+from scenes import ball, body, box, scene_of, solid
 from scipy.optimize import brentq
-from solver_state import bodies_of, scene_of
+from solver_state import bodies_of
 
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
@@ -23,19 +24,19 @@ H = 0.05
 
 def block(**tables: object) -> Scene:
     """Return a block of 8 x 6 cells of jelly in free space."""
-    shape = {"box": {"min": [0.4, 0.4], "max": [0.8, 0.7]}}
+    shape = box([0.4, 0.4], [0.8, 0.7])
     return scene_of(
+        body("block", JELLY, shape),
         domain={"size": [2.0, 1.2], "spacing": H} | tables.pop("domain", {}),
         time={"end": 0.2, "frames": 4},
-        bodies=[{"name": "block", "material": JELLY, "shape": shape}],
-        solver={"precision": "f64"},
+        precision="f64",
         **tables,
     )
 
 
 def held(**more: object) -> dict:
     """Return what holds the left end of the block, three cells wide, and moves it; one kernel is for all of these."""
-    shape = {"box": {"min": [0.3, 0.3], "max": [0.55, 0.8]}}
+    shape = box([0.3, 0.3], [0.55, 0.8])
     return {"name": "clamp", "wall": "hold", "shape": shape, "offset": ["0.2 * t", "0.0"], **more}
 
 
@@ -47,28 +48,21 @@ def run(scene: Scene, backend_of: Callable) -> tuple[Frame, Frame, list[LedgerRo
 
 # Where a force acts on each of three blocks: all of it, its right half, and a disk in its middle.
 LOWS = {"whole": (0.2, 0.15), "half": (0.2, 0.7), "disk": (0.8, 0.4)}
-REGIONS = {
-    "whole": {},
-    "half": {"region": {"box": {"min": [0.4, 0.0], "max": [0.8, 1.2]}}},
-    "disk": {"region": {"ball": {"center": [1.0, 0.55], "radius": 0.1}}},
-}
+REGIONS = {"whole": {}, "half": {"region": box([0.4, 0.0], [0.8, 1.2])}, "disk": {"region": ball([1.0, 0.55], 0.1)}}
 
 
 def pushed() -> Scene:
     """Return three blocks and a rigid ball that forces push, far from each other, in one scene for one kernel."""
     return scene_of(
+        *(body(name, JELLY, box([x, y], [x + 0.4, y + 0.3])) for name, (x, y) in LOWS.items()),
         domain={"size": [2.0, 1.2], "spacing": H},
         time={"end": 0.2, "frames": 4},
-        bodies=[
-            {"name": name, "material": JELLY, "shape": {"box": {"min": [x, y], "max": [x + 0.4, y + 0.3]}}}
-            for name, (x, y) in LOWS.items()
-        ],
-        colliders=[{"name": "ball", "density": 500.0, "shape": {"ball": {"center": [1.6, 0.6], "radius": 0.15}}}],
+        colliders=[{"name": "ball", "density": 500.0, "shape": ball([1.6, 0.6], 0.15)}],
         forces=[
             *({"body": name, "force": [60.0, -20.0], **region} for name, region in REGIONS.items()),
             {"body": "ball", "force": [30.0, 0.0]},
         ],
-        solver={"precision": "f64"},
+        precision="f64",
     )
 
 
@@ -115,20 +109,14 @@ def gripped(first: dict, second: dict) -> Scene:
 
     Their faces are half a cell from nodes: what is held then ends at the faces, and elsewhere up to half a cell off.
     """
-    ends = ({"min": [0.3, 0.3], "max": [0.7251, 0.9]}, {"min": [1.2749, 0.3], "max": [1.8, 0.9]})
+    ends = box([0.3, 0.3], [0.7251, 0.9]), box([1.2749, 0.3], [1.8, 0.9])
     return scene_of(
+        body("bar", solid(2e4, poissons_ratio=0.3), box([0.6, 0.5], [1.4, 0.7])),
         domain={"size": [2.0, 1.2], "spacing": H},
-        time={"end": 1.0, "frames": 4},
-        bodies=[
-            {
-                "name": "bar",
-                "material": {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 2e4, "poissons_ratio": 0.3},
-                "shape": {"box": {"min": [0.6, 0.5], "max": [1.4, 0.7]}},
-            }
-        ],
+        frames=4,
         colliders=[
-            {"name": f"clamp {k}", "wall": "hold", "shape": {"box": box}, **more}
-            for k, (box, more) in enumerate(zip(ends, (first, second), strict=True))
+            {"name": f"clamp {k}", "wall": "hold", "shape": end, **more}
+            for k, (end, more) in enumerate(zip(ends, (first, second), strict=True))
         ],
         solver={"precision": "f64", "solids": "total"},
     )
@@ -169,7 +157,7 @@ def test_it_moves_along_a_path_and_lets_go_of_axes(backend_of: Callable) -> None
     moved = frame.position - start.position
     inside = start.position[:, 0] < 0.55 - 2 * H
     assert moved[inside] == pytest.approx(np.tile([0.04, 0.0], (inside.sum(), 1)), abs=1e-12)
-    whole = held(axes=["y"]) | {"shape": {"box": {"min": [0.0, 0.0], "max": [2.0, 1.2]}}}
+    whole = held(axes=["y"]) | {"shape": box([0.0, 0.0], [2.0, 1.2])}
     start, frame, rows = run(block(domain={"gravity": [1.0, -9.81]}, colliders=[whole]), backend_of)
     moved = frame.position - start.position
     assert moved == pytest.approx(np.tile([0.5 * 0.2**2, 0.0], (len(moved), 1)), rel=1e-6, abs=1e-12)
@@ -201,7 +189,7 @@ def test_a_beam_bends_as_one_that_a_wall_holds(backend_of: Callable, shift: floa
     domain = tables["domain"]
     domain["origin"], domain["size"][0] = [-1.0 - shift * domain["spacing"], -BELOW], domain["size"][0] + 1.0
     del domain["walls"]
-    tables["bodies"][0]["shape"] = {"box": {"min": [-0.75, 0.0], "max": [LENGTH, THICKNESS]}}
+    tables["bodies"][0]["shape"] = box([-0.75, 0.0], [LENGTH, THICKNESS])
     clamp = {"min": [-0.9, -0.5], "max": [0.0, THICKNESS + 0.5]}
     tables["colliders"] = [{"name": "clamp", "wall": "hold", "shape": {"box": clamp}}]
     tables["solver"] = {"precision": "f64"}
@@ -212,12 +200,8 @@ def test_a_beam_bends_as_one_that_a_wall_holds(backend_of: Callable, shift: floa
 
 
 HOLD = """\
-[domain]
-size = [2.0, 1.0]
-spacing = 0.05
-[time]
-end = 0.2
-frames = 4
+domain = { size = [2.0, 1.0], spacing = 0.05 }
+time = { end = 0.2, frames = 4 }
 [[bodies]]
 name = "block"
 material = "jelly"
@@ -232,21 +216,18 @@ force = [1.0, 0.0]
 """
 
 
-@pytest.mark.parametrize(
-    ("good", "bad", "said"),
-    [
-        ('wall = "hold"', 'wall = "stick"\naxes = ["x"]', 'axes: is for wall = "hold", and wall is "stick"'),
-        ('wall = "hold"', 'wall = "hold"\naxes = []', "axes: must be some of x, y; found []"),
-        ('wall = "hold"', 'wall = "hold"\naxes = ["z"]', "axes: must be some of x, y; found ['z']"),
-        ('wall = "hold"', 'wall = "hold"\nfriction = 0.3', 'friction: is for a surface that slips or separates'),
-        ('wall = "hold"', 'wall = "hold"\ndensity = 10.0', 'wall: is "hold", which is for the inside'),
-        ('body = "block"\n', "", "body: missing key: the body that the force is spread over"),
-        ("force = [1.0, 0.0]", "", "acceleration: missing key: m/s^2, one entry per axis; or give force, N"),
-        ("force = [1.0, 0.0]", "force = [1.0, 0.0]\nregion = { ball = { center = [1.5, 0.5], radius = 0.1 } }",
-         "region: no particle starts there; move it or make it larger"),
-        ("force = [1.0, 0.0]", "force = [1.0, 0.0]\nregion = {}", "region: must be one of box and ball"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("good", "bad", "said"), [
+    ('wall = "hold"', 'wall = "stick"\naxes = ["x"]', 'axes: is for wall = "hold", and wall is "stick"'),
+    ('wall = "hold"', 'wall = "hold"\naxes = []', "axes: must be some of x, y; found []"),
+    ('wall = "hold"', 'wall = "hold"\naxes = ["z"]', "axes: must be some of x, y; found ['z']"),
+    ('wall = "hold"', 'wall = "hold"\nfriction = 0.3', 'friction: is for a surface that slips or separates'),
+    ('wall = "hold"', 'wall = "hold"\ndensity = 10.0', 'wall: is "hold", which is for the inside'),
+    ('body = "block"\n', "", "body: missing key: the body that the force is spread over"),
+    ("force = [1.0, 0.0]", "", "acceleration: missing key: m/s^2, one entry per axis; or give force, N"),
+    ("force = [1.0, 0.0]", "force = [1.0, 0.0]\nregion = { ball = { center = [1.5, 0.5], radius = 0.1 } }",
+     "region: no particle starts there; move it or make it larger"),
+    ("force = [1.0, 0.0]", "force = [1.0, 0.0]\nregion = {}", "region: must be one of box and ball"),
+])  # fmt: skip
 def test_each_bad_one_has_its_sentence(good: str, bad: str, said: str) -> None:
     (line,) = refusal(HOLD.replace(good, bad))
     assert said in line

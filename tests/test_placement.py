@@ -235,12 +235,8 @@ count = 3
 region = { min = [0.0, 0.0, 0.0], max = [0.8, 1.0, 1.0] }
 """
 BASE_3D = """\
-[domain]
-size = [1.0, 1.0, 1.0]
-cells = [20, 20, 20]
-[time]
-end = 0.1
-frames = 4
+domain = { size = [1.0, 1.0, 1.0], cells = [20, 20, 20] }
+time = { end = 0.1, frames = 4 }
 [[bodies]]
 name = "brick"
 material = "jelly"

@@ -8,7 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from solver_state import scene_of
+from scenes import block, scene_of, slow
 
 from mpmcli.errors import InputError
 from mpmcli.materials.registry import laws, parameter_models
@@ -31,18 +31,15 @@ MATERIALS = {
 CONFIGS = Path(__file__).parents[1] / "configs"
 
 
-@pytest.mark.parametrize(
-    ("name", "solver"),
-    [
-        ("dam_break_2d", {}),
-        # Deformation gradients, layers of bodies, rigid bodies, emitters with expressions, and meshes of colliders.
-        ("mixed_2d", {"precision": "f64"}),
-        ("rolling_3d", {}),
-        ("stirred_tank_2d", {"grid": "sparse"}),
-        ("fountain_2d", {}),
-        ("jelly_drop_2d", {"solids": "total"}),
-    ],
-)
+@pytest.mark.parametrize(("name", "solver"), [
+    ("dam_break_2d", {}),
+    # Deformation gradients, layers of bodies, rigid bodies, emitters with expressions, and meshes of colliders.
+    ("mixed_2d", {"precision": "f64"}),
+    ("rolling_3d", {}),
+    ("stirred_tank_2d", {"grid": "sparse"}),
+    ("fountain_2d", {}),
+    ("jelly_drop_2d", {"solids": "total"}),
+])  # fmt: skip
 def test_the_plan_is_what_taichi_allocates(backend_of: Callable, name: str, solver: dict) -> None:
     """Bytes of its trees of nodes, but for the alignment of each."""
     scene = load_scene(CONFIGS / f"{name}.toml", laws=parameter_models()).scene
@@ -88,24 +85,15 @@ def test_the_plan_has_the_bytes_of_a_particle_and_of_a_node(backend_of: Callable
     assert plan.bytes_per_node == 4 * (4 + 2**d)
 
 
-@pytest.mark.parametrize(
-    "fields", [["stress", "pressure", "initial_position"], pytest.param(["density"], marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("fields", [["stress", "pressure", "initial_position"], slow(["density"])])
 def test_the_plan_counts_what_the_host_holds(tmp_path: Path, fields: list[str]) -> None:
     """The most that numpy holds from the first particle to the last frame, beside 4 MB of parts and tables."""
     h = 1 / 800
     scene = scene_of(
+        block("block", MATERIALS["fluid"], [0.2, 0.2], [0.6, 0.6]),
         domain={"size": [1.0, 1.0], "spacing": h, "gravity": [0.0, -9.81]},
         time={"end": 4e-6, "frames": 2, "step": 2e-6},
-        solver={"precision": "f32"},
-        bodies=[
-            {
-                "name": "block",
-                "material": MATERIALS["fluid"],
-                "shape": {"box": {"min": [0.2, 0.2], "max": [0.6, 0.6]}},
-            }
-        ],
-        output={"fields": fields},
+        fields=fields,
     )
     stop_backend()
     backend = replace(choose_backend("cpu", 1, "f32"), optimisation="few")
@@ -129,18 +117,16 @@ def scene_with(*materials: str, dimension: int = 2) -> Scene:
     """Return a scene of one small block for each material, side by side."""
     d, h = dimension, 0.1
     return scene_of(
-        domain={"size": [h * (2 + 4 * len(materials))] + [8 * h] * (d - 1), "spacing": h, "gravity": [0.0] * d},
-        time={"end": 1.0, "frames": 1},
-        bodies=[
-            {
-                "name": f"body {k}",
-                "material": MATERIALS[material],
-                "shape": {
-                    "box": {"min": [h + 4 * h * k] + [h] * (d - 1), "max": [3 * h + 4 * h * k] + [3 * h] * (d - 1)}
-                },
-            }
+        *(
+            block(
+                f"body {k}",
+                MATERIALS[material],
+                [h + 4 * h * k] + [h] * (d - 1),
+                [3 * h + 4 * h * k] + [3 * h] * (d - 1),
+            )
             for k, material in enumerate(materials)
-        ],
+        ),
+        domain={"size": [h * (2 + 4 * len(materials))] + [8 * h] * (d - 1), "spacing": h, "gravity": [0.0] * d},
     )
 
 
@@ -211,17 +197,10 @@ def test_more_than_an_index_reaches_is_refused(
     """Whatever array it is; frames and tables of the sort are the longest ones."""
     monkeypatch.setattr("mpmcli.solver.engine.plan.MEMORY_SHARE", 1e6)
     scene = scene_of(
+        block("block", {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 1e5}, [1.0] * 3, [1.0 + edge] * 3),
         domain={"size": [float(cells)] * 3, "spacing": 1.0},
-        time={"end": 1.0, "frames": 1},
-        output={"fields": fields},
-        solver={"grid": "dense"},
-        bodies=[
-            {
-                "name": "block",
-                "material": {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 1e5},
-                "shape": {"box": {"min": [1.0] * 3, "max": [1.0 + edge] * 3}},
-            }
-        ],
+        fields=fields,
+        grid="dense",
     )
     plan = make_plan(scene, Backend("cpu", threads, "f32", False))
     if fits:
@@ -288,7 +267,6 @@ def test_a_device_is_there_if_the_driver_says_so(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr("mpmcli.solver.machine.backend.os.path.exists", lambda name: False)
     for present in (True, False):
         monkeypatch.setattr(
-            "mpmcli.solver.machine.backend.ctypes.CDLL",
-            lambda name, present=present: FakeDriver(1, present=present),
+            "mpmcli.solver.machine.backend.ctypes.CDLL", lambda name, present=present: FakeDriver(1, present=present)
         )
         assert has_cuda_device() is present

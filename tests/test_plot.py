@@ -208,22 +208,17 @@ def test_a_file_that_it_did_not_make_is_replaced_only_when_asked_to(result, tmp_
     assert outcome.stdout == f"{path}\n" and path.read_bytes() != before
 
 
-@pytest.mark.parametrize(
-    ("arguments", "sentence"),
-    [
-        (["nothing"], "error: nothing does not exist"),
-        (["result", "-o", "picture.jpg"], "error: picture.jpg cannot be a picture of this command: give a name that "),
-        (["result", "--size", "12"], 'error: --size "12" is not a size: give width and height, such as'),
-        (
-            ["result", "--size", "100x100"],
-            "error: --size 100x100 is not possible: each side of this picture has 300 to 8000 pixels.",
-        ),
-        (["result", "--size", "300x900"], "error: --size 300x900 leaves no room for the panels: give a width of one"),
-        (["result", "-o", "file/picture.png"], "error: file/picture.png cannot be written (file is no directory): "),
-        (["result", "--theme", "pink"], "error: invalid value for '--theme'"),
-        ([], "error: missing argument 'RESULT'. See mpmcli plot --help."),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "sentence"), [
+    (["nothing"], "error: nothing does not exist"),
+    (["result", "-o", "picture.jpg"], "error: picture.jpg cannot be a picture of this command: give a name that "),
+    (["result", "--size", "12"], 'error: --size "12" is not a size: give width and height, such as'),
+    (["result", "--size", "100x100"],
+     "error: --size 100x100 is not possible: each side of this picture has 300 to 8000 pixels."),
+    (["result", "--size", "300x900"], "error: --size 300x900 leaves no room for the panels: give a width of one"),
+    (["result", "-o", "file/picture.png"], "error: file/picture.png cannot be written (file is no directory): "),
+    (["result", "--theme", "pink"], "error: invalid value for '--theme'"),
+    ([], "error: missing argument 'RESULT'. See mpmcli plot --help."),
+])  # fmt: skip
 def test_bad_input_is_refused_with_one_sentence(result, tmp_path, monkeypatch, arguments, sentence):
     monkeypatch.chdir(tmp_path)
     Path("file").write_text("x", encoding="utf-8")

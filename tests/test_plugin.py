@@ -69,13 +69,8 @@ LAW = LogFluid
 
 SCENE = """\
 title = "A block of a new law"
-[domain]
-size = [1.0, 1.0]
-cells = [16, 16]
-gravity = [0.0, -9.81]
-[time]
-end = 0.05
-frames = 4
+domain = { size = [1.0, 1.0], cells = [16, 16], gravity = [0.0, -9.81] }
+time = { end = 0.05, frames = 4 }
 [[bodies]]
 name = "block"
 material = { law = "log_fluid", density = 1000.0, swiftness = 0.75 }
@@ -154,7 +149,7 @@ def test_simulate_runs_the_law():
 
 def test_a_scene_alone_runs_no_code():
     said = refused("simulate", "scene.toml")
-    assert said.startswith('scene.toml:11: bodies[0].material.law: unknown law "log_fluid"; ')
+    assert said.startswith('scene.toml:6: bodies[0].material.law: unknown law "log_fluid"; ')
     # Nor is the law of one command there for the next.
     run_here("materials", "--plugin", "law.py")
     assert "log_fluid" in laws()
@@ -179,29 +174,17 @@ def test_several_plugins_make_several_laws():
 # What is replaced in the law, by what, and what is said.
 FAULTS = {
     "no LAW": (("LAW = LogFluid", ""), "law.py: the file defines no LAW; end it with LAW = YourLaw"),
-    "no class": (
-        ("LAW = LogFluid", "LAW = 3"),
-        "law.py: LAW must be a subclass of mpmcli.materials.law.Law; found 3",
-    ),
-    "another class": (
-        ("LAW = LogFluid", "LAW = LogFluidParameters"),
-        "law.py: LAW must be a subclass of mpmcli.materials.law.Law; found <class 'mpmcli_plugin_0_law.LogFluidParam",
-    ),
-    "name taken": (
-        ("log_fluid", "fluid"),
-        'law.py: "fluid" is the name of a law of mpmcli; give LAW another name',
-    ),
-    "two names": (
-        ('name = "log_fluid"', 'name = "other"'),
-        "law.py: LogFluid.name is \"other\", and law in its parameters is 'log_fluid'; both must be the same word",
-    ),
+    "no class": (("LAW = LogFluid", "LAW = 3"), "law.py: LAW must be a subclass of mpmcli.materials.law.Law; found 3"),
+    "another class": (("LAW = LogFluid", "LAW = LogFluidParameters"),
+        "law.py: LAW must be a subclass of mpmcli.materials.law.Law; found <class 'mpmcli_plugin_0_law.LogFluidParam"),
+    "name taken": (("log_fluid", "fluid"), 'law.py: "fluid" is the name of a law of mpmcli; give LAW another name'),
+    "two names": (('name = "log_fluid"', 'name = "other"'),
+        "law.py: LogFluid.name is \"other\", and law in its parameters is 'log_fluid'; both must be the same word"),
     "no name": (('    name = "log_fluid"\n', ""), "law.py: LogFluid does not define name"),
     "no modes": (("def modes(", "def mode("), "law.py: LogFluid does not define modes()"),
     "no energy": (("def energy(", "def energies("), "law.py: LogFluid does not define energy()"),
-    "no parameters": (
-        ("parameters = LogFluidParameters", "parameters = dict"),
-        "law.py: LogFluid.parameters must be a subclass of MaterialParameters; found <class 'dict'>",
-    ),
+    "no parameters": (("parameters = LogFluidParameters", "parameters = dict"),
+        "law.py: LogFluid.parameters must be a subclass of MaterialParameters; found <class 'dict'>"),
     "raises": (("import math\n", "import math\n1 / 0\n"), "law.py:4: ZeroDivisionError: division by zero"),
     "raises deeper": (
         ("import math\n", "import math\nmath.sqrt(\n    -1)\n"),
@@ -210,7 +193,7 @@ FAULTS = {
     "no module": (("import math\n", "import maths\n"), "law.py:3: ModuleNotFoundError: No module named 'maths'"),
     "syntax": (("import math\n", "import math math\n"), "law.py:3: SyntaxError: invalid syntax"),
     "exits": (("import math\n", "raise SystemExit('enough')\n"), "law.py:3: SystemExit: enough"),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("fault", FAULTS)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import taichi as ti
 from made_result import made_frame, made_header
-from solver_state import scene_of
+from scenes import block, liquid, scene_of, solid
 
 from mpmcli.check.finding import FrameFindings
 from mpmcli.check.result_state import StateCheck
@@ -24,19 +24,15 @@ def two_blocks(dimension: int, end: float, solids: str = "updated") -> Scene:
     """Return the scene; axes but the first are short."""
     rest = dimension - 1
 
-    def block(name: str, low: float, speed: float) -> dict:
-        return {
-            "name": name,
-            "material": {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 1e5},
-            "shape": {"box": {"min": [low] + [0.4] * rest, "max": [low + 0.2] + [0.6] * rest}},
-            "velocity": [speed] + [0.0] * rest,
-        }
-
+    blocks = ("slow", 8.5, SPEED), ("fast", 1.0, 1.0)
     return scene_of(
+        *(
+            block(name, solid(1e5), [x, *[0.4] * rest], [x + 0.2, *[0.6] * rest], velocity=[speed, *[0.0] * rest])
+            for name, x, speed in blocks
+        ),
         domain={"size": [10.0] + [1.0] * rest, "spacing": 0.1},
-        time={"end": end, "frames": 1, "step": STEP},
-        bodies=[block("slow", 8.5, SPEED), block("fast", 1.0, 1.0)],
-        solver={"solids": solids},
+        time={"end": end, "step": STEP},
+        solids=solids,
     )
 
 
@@ -100,30 +96,20 @@ def test_remainders(backend_of: Callable) -> None:
     assert (error <= 2.0**-23 * np.abs(way)[~held] + 2.0**-47).all()
 
 
-@pytest.mark.parametrize(
-    ("walls", "settings", "holds"),
-    [
-        ("slip", {}, False),
-        pytest.param("separate", {}, False, marks=pytest.mark.slow),
-        pytest.param("stick", {}, False, marks=pytest.mark.slow),
-        pytest.param("slip", {"transfer": "aflip"}, False, marks=pytest.mark.slow),
-        pytest.param("slip", {"kernel": "cubic"}, False, marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.parametrize(("walls", "settings", "holds"), [
+    ("slip", {}, False),
+    pytest.param("separate", {}, False, marks=pytest.mark.slow),
+    pytest.param("stick", {}, False, marks=pytest.mark.slow),
+    pytest.param("slip", {"transfer": "aflip"}, False, marks=pytest.mark.slow),
+    pytest.param("slip", {"kernel": "cubic"}, False, marks=pytest.mark.slow),
+])  # fmt: skip
 def test_folded_walls_hold_no_particle(backend_of: Callable, walls: str, settings: dict, holds: bool) -> None:
     """A block of liquid splashes in a corner, at the whole of the stable step: none is put on a wall of its domain."""
     scene = scene_of(
+        block("liquid", liquid(1e5), [0.125, 0.125], [0.5, 0.5], velocity=[-3.0, -2.0]),
         domain={"size": [1.0, 1.0], "cells": [32, 32], "gravity": [0.0, -10.0], "walls": walls},
         time={"end": 0.5, "frames": 50, "safety": 1.0},
         solver=settings,
-        bodies=[
-            {
-                "name": "liquid",
-                "material": {"law": "fluid", "density": 1000.0, "bulk_modulus": 1e5},
-                "shape": {"box": {"min": [0.125, 0.125], "max": [0.5, 0.5]}},
-                "velocity": [-3.0, -2.0],
-            }
-        ],
     )
     run = build_run(scene, backend_of("f32", 1))
     on_walls = [((f.position <= 0) | (f.position >= 1)).any(axis=1).sum() for f, _ in run.frames()]

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 from durable_record import DurableRecord, Image, make_copy, recorded
+from scenes import block, solid, tables_of
 from test_resume import invented
 
 from mpmcli.frames.frame import Frame
@@ -25,18 +26,9 @@ PACKED = "run/out/particles.vtkhdf"
 
 
 def falling_block(frames: int = FRAMES) -> LoadedScene:
-    data = {
-        "domain": {"size": [1.0, 1.0], "cells": [10, 10], "gravity": [0.0, -9.81]},
-        "time": {"end": frames / 64, "frames": frames},
-        "solver": {"precision": "f32"},
-        "bodies": [
-            {
-                "name": "block",
-                "material": {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 1e5},
-                "shape": {"box": {"min": [0.3, 0.1], "max": [0.7, 0.4]}},
-            }
-        ],
-    }
+    domain = {"size": [1.0, 1.0], "cells": [10, 10], "gravity": [0.0, -9.81]}
+    one = block("block", solid(1e5), [0.3, 0.1], [0.7, 0.4])
+    data = tables_of(one, domain=domain, end=frames / 64, frames=frames, precision="f32", contact={})
     return parse_scene(data, laws=parameter_models(), source="block.toml")
 
 

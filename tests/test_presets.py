@@ -16,15 +16,10 @@ KNOBS = [(law, name) for law in sorted(LAWS) for name in knobs_of(LAWS[law])]
 # A preset of each law that has one.
 SAMPLES = {preset.law: name for name, preset in PRESETS.items()}
 
-# The material stands on line 11.
+# The material stands on line 6.
 SCENE = """\
-[domain]
-size = {size}
-spacing = 0.1
-gravity = {gravity}
-[time]
-end = 1.0
-frames = 10
+domain = {{ size = {size}, spacing = 0.1, gravity = {gravity} }}
+time = {{ end = 1.0, frames = 10 }}
 [[bodies]]
 name = "pool"
 shape.box = {{ min = {low}, max = {high} }}
@@ -188,10 +183,8 @@ REFUSED = [
     ('{ law = "honey" }', 'material.law: "honey" is a preset: write preset = "honey"'),
     ('{ law = "fluyd" }', 'material.law: unknown law "fluyd"; did you mean "fluid"? The laws are "fixed_corotated", '),
     ("{ law = [] }", "material.law: must be text in quotes; found []"),
-    (
-        '{ law = "fluid", preset = "honey" }',
-        "material.law: the preset has a law of its own; leave either the law or the preset out",
-    ),
+    ('{ law = "fluid", preset = "honey" }',
+     "material.law: the preset has a law of its own; leave either the law or the preset out"),
     ('{ preset = "honey", thickness = 1.5 }', "material.thickness: must be a number from 0 to 1; found 1.5"),
     ('{ preset = "honey", thickness = -0.1 }', "material.thickness: must be a number from 0 to 1; found -0.1"),
     ('{ preset = "honey", thickness = nan }', "material.thickness: must be a number from 0 to 1; found nan"),
@@ -201,47 +194,35 @@ REFUSED = [
     ('{ preset = "honey", viscosty = 0.5 }', 'material.viscosty: unknown key; did you mean "viscosity"?'),
     ('{ preset = "honey", viscosity = -1 }', "material.viscosity: must be at least 0; found -1"),
     ('{ preset = "rubber", poissons_ratio = 0.5 }', "material.poissons_ratio: must be less than 0.5; found 0.5"),
-    (
-        '{ preset = "honey", thickness = 0.5, viscosity = 3 }',
-        "material.thickness: sets viscosity, which is given as well; leave one of them out",
-    ),
-    (
-        '{ preset = "water", stiffness = 0.5, bulk_modulus = 2e6 }',
-        "material.stiffness: sets compressibility, which bulk_modulus = 2000000.0 overrules; leave one of them out",
-    ),
-    (
-        '{ preset = "honey", springiness = 0.5 }',
-        'material.springiness: the law fluid has no knob "springiness"; its knobs are "stiffness" and "thickness"',
-    ),
-    (
-        '{ preset = "rubber", thickness = 0.5 }',
-        'material.thickness: the law neo_hookean has no knob "thickness"; its knob is "springiness"',
-    ),
-    (
-        '{ preset = "rubber", viscosity = 0.5 }',
-        'material.viscosity: the law neo_hookean has no parameter "viscosity"; its parameters are "density", '
-        '"poissons_ratio", "surface_friction" and "youngs_modulus"',
-    ),
-    (
-        '{ law = "neo_hookean", density = 1 }',
-        "material.youngs_modulus: missing key: Young's modulus E, Pa; or its knob springiness, 0 to 1",
-    ),
-]
+    ('{ preset = "honey", thickness = 0.5, viscosity = 3 }',
+     "material.thickness: sets viscosity, which is given as well; leave one of them out"),
+    ('{ preset = "water", stiffness = 0.5, bulk_modulus = 2e6 }',
+     "material.stiffness: sets compressibility, which bulk_modulus = 2000000.0 overrules; leave one of them out"),
+    ('{ preset = "honey", springiness = 0.5 }',
+     'material.springiness: the law fluid has no knob "springiness"; its knobs are "stiffness" and "thickness"'),
+    ('{ preset = "rubber", thickness = 0.5 }',
+     'material.thickness: the law neo_hookean has no knob "thickness"; its knob is "springiness"'),
+    ('{ preset = "rubber", viscosity = 0.5 }',
+     'material.viscosity: the law neo_hookean has no parameter "viscosity"; its parameters are "density", '
+     '"poissons_ratio", "surface_friction" and "youngs_modulus"'),
+    ('{ law = "neo_hookean", density = 1 }',
+     "material.youngs_modulus: missing key: Young's modulus E, Pa; or its knob springiness, 0 to 1"),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("material", "sentence"), REFUSED, ids=[material for material, _ in REFUSED])
 def test_each_bad_material_has_its_sentence(material, sentence):
     (line,) = refusal(material)
-    assert line.startswith(f"scene.toml:11: bodies[0].{sentence}")
+    assert line.startswith(f"scene.toml:6: bodies[0].{sentence}")
 
 
 def test_all_faults_of_a_material_come_at_once_each_at_its_line():
     text = '"honey"\n[[bodies]]\nname = "b"\nshape.ball = { center = [0.8, 0.8], radius = 0.1 }\n[bodies.material]\n'
     text += 'preset = "honey"\nthicknes = 2\nviscosity = 1\ndensty = -1\nstiffness = 7'
     assert refusal(text) == [
-        'scene.toml:17: bodies[1].material.thicknes: unknown key; did you mean "thickness"?',
-        'scene.toml:19: bodies[1].material.densty: unknown key; did you mean "density"?',
-        "scene.toml:20: bodies[1].material.stiffness: must be a number from 0 to 1; found 7",
+        'scene.toml:12: bodies[1].material.thicknes: unknown key; did you mean "thickness"?',
+        'scene.toml:14: bodies[1].material.densty: unknown key; did you mean "density"?',
+        "scene.toml:15: bodies[1].material.stiffness: must be a number from 0 to 1; found 7",
     ]
 
 
@@ -291,20 +272,17 @@ def test_a_logarithmic_knob_has_no_end_at_zero():
         Knob("wrong", 0.0, 1.0, "0 is nothing")
 
 
-@pytest.mark.parametrize(
-    ("description", "unit"),
-    [
-        ("Young's modulus E, Pa.", "Pa"),
-        ("Viscosity, Pa s; water 1e-3.", "Pa s"),
-        ("Consistency, Pa s^n: the stress at unit rate.", "Pa s^n"),
-        ("Density at rest, kg/m^3.", "kg/m^3"),
-        ('Angle, degrees; "auto" is none.', "degrees"),
-        ("Speed, m/s", "m/s"),
-        ("Rate, 1/s (engineering).", ""),
-        ("A fraction, 0 to 1.", ""),
-        ("Poisson's ratio, between -1 and 0.5, both excluded.", ""),
-        (None, ""),
-    ],
-)
+@pytest.mark.parametrize(("description", "unit"), [
+    ("Young's modulus E, Pa.", "Pa"),
+    ("Viscosity, Pa s; water 1e-3.", "Pa s"),
+    ("Consistency, Pa s^n: the stress at unit rate.", "Pa s^n"),
+    ("Density at rest, kg/m^3.", "kg/m^3"),
+    ('Angle, degrees; "auto" is none.', "degrees"),
+    ("Speed, m/s", "m/s"),
+    ("Rate, 1/s (engineering).", ""),
+    ("A fraction, 0 to 1.", ""),
+    ("Poisson's ratio, between -1 and 0.5, both excluded.", ""),
+    (None, ""),
+])  # fmt: skip
 def test_units_are_read_from_descriptions(description, unit):
     assert unit_of(description) == unit

@@ -154,21 +154,18 @@ def test_a_run_that_ends_early_raises(monkeypatch: pytest.MonkeyPatch, status: s
         mpmcli.run(tomllib.loads(SCENE), "out", progress=False)
 
 
-@pytest.mark.parametrize(
-    ("ask", "sentence"),
-    [
-        (lambda data, _: mpmcli.load_scene("dam_brek_2d"), 'did you mean "dam_break_2d"?'),
-        (lambda data, _: mpmcli.load_scene(data, **{"time.edn": 1.0}), 'unknown key; did you mean "end"?'),
-        (lambda data, _: mpmcli.run(data), "the scene comes from no file that could name its result: give output"),
-        (lambda data, _: mpmcli.run(mpmcli.load_scene(data)), "give output, a directory"),
-        (lambda data, _: mpmcli.load_scene(mpmcli.load_scene(data), title="b"), "give its overrides to load_scene"),
-        (lambda data, _: mpmcli.run(data, "out", resume=True, overwrite=True), "give one of them"),
-        (lambda data, _: mpmcli.sweep("none.toml"), "none.toml: there is no such file"),
-        (lambda data, dataset: dataset.windows("trian"), 'there is no split "trian": the splits are "train", "valid"'),
-        (lambda data, dataset: dataset.windows(past=0), "a window has one past frame or more"),
-        (lambda data, dataset: dataset.windows(fields=["heat"])[0], 'holds no field "heat"'),
-    ],
-)
+@pytest.mark.parametrize(("ask", "sentence"), [
+    (lambda data, _: mpmcli.load_scene("dam_brek_2d"), 'did you mean "dam_break_2d"?'),
+    (lambda data, _: mpmcli.load_scene(data, **{"time.edn": 1.0}), 'unknown key; did you mean "end"?'),
+    (lambda data, _: mpmcli.run(data), "the scene comes from no file that could name its result: give output"),
+    (lambda data, _: mpmcli.run(mpmcli.load_scene(data)), "give output, a directory"),
+    (lambda data, _: mpmcli.load_scene(mpmcli.load_scene(data), title="b"), "give its overrides to load_scene"),
+    (lambda data, _: mpmcli.run(data, "out", resume=True, overwrite=True), "give one of them"),
+    (lambda data, _: mpmcli.sweep("none.toml"), "none.toml: there is no such file"),
+    (lambda data, dataset: dataset.windows("trian"), 'there is no split "trian": the splits are "train", "valid"'),
+    (lambda data, dataset: dataset.windows(past=0), "a window has one past frame or more"),
+    (lambda data, dataset: dataset.windows(fields=["heat"])[0], 'holds no field "heat"'),
+])  # fmt: skip
 def test_bad_input_has_a_sentence(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ask: Callable, sentence: str
 ) -> None:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
-from solver_state import scene_of
+from scenes import ball, block, body, box, scene_of
 from test_batch import batch_of, outputs_of, same
 from test_check_frames import header_of
 from test_deterministic import on_gpu_path, twice
@@ -30,19 +30,14 @@ def crowded(
     """Return bodies side by side that fill a domain, whose particles tests put elsewhere."""
     length = 1.0 if dimension == 2 else 0.6
     edges = np.linspace(0.0, length, len(materials) + 1)
-    high = [1.0] if dimension == 2 else [0.5, 0.5]
+    high, count = [1.0] if dimension == 2 else [0.5, 0.5], per_cell or 2**dimension
     bodies = [
-        {
-            "name": f"body {k}",
-            "material": material,
-            "shape": {"box": {"min": [low] + [0.0] * (dimension - 1), "max": [edges[k + 1], *high]}},
-            "particles_per_cell": per_cell or 2**dimension,
-        }
+        block(f"body {k}", material, [low, *[0.0] * len(high)], [edges[k + 1], *high], particles_per_cell=count)
         for k, (material, low) in enumerate(zip(materials, edges, strict=False))
     ]
     solver = {"precision": "f64", **solver}
     domain = {"size": [length, *high], "spacing": H, "walls": walls}
-    return scene_of(domain=domain, time={"end": 1.0, "frames": 1}, bodies=bodies, solver=solver)
+    return scene_of(*bodies, domain=domain, solver=solver)
 
 
 def spline(r: np.ndarray, *, cubic: bool) -> np.ndarray:
@@ -235,20 +230,11 @@ def test_momenta_stay_where_drops_collide(backend_of: Callable) -> None:
     backend, spread = backend_of("f64", 1), []
     for moved in (0.0, 0.3 * 0.02):
         drops = [
-            {
-                "name": f"drop {1 + sign}",
-                "material": WATER,
-                "shape": {"ball": {"center": [1.5 + 0.25 * sign + moved, 1.5 + 0.05 * sign - moved], "radius": 0.2}},
-                "velocity": [-1.0 * sign, 0.0],
-            }
+            body(f"drop {1 + sign}", WATER, ball(center, 0.2), velocity=[-1.0 * sign, 0.0])
             for sign in (-1, 1)
+            for center in [[1.5 + 0.25 * sign + moved, 1.5 + 0.05 * sign - moved]]
         ]
-        scene = scene_of(
-            domain={"size": [3.0, 3.0], "spacing": 0.02, "walls": "separate"},
-            time={"end": 0.35, "frames": 1},
-            bodies=drops,
-            solver={"precision": "f64"},
-        )
+        scene = scene_of(*drops, size=[3.0, 3.0], spacing=0.02, walls="separate", end=0.35, precision="f64")
         (_, before), (frame, after) = build_run(scene, backend).frames()
         change = np.subtract(after.linear_momentum, before.linear_momentum)
         assert np.abs(change).max() < (5e-5 if moved else 1e-6) * before.mass
@@ -274,9 +260,9 @@ def column(*, redistribute: object, spacing: float = 0.05, frames: int = 2, **mo
     """Return a dam break of 2 x 1 m that has met the far wall, 800 particles."""
     body = {"name": "column", "material": WATER | {"bulk_modulus": "auto"}}
     return scene_of(
+        body | {"shape": box([0.0, 0.0], [1.0, 1.0])} | more,
         domain={"size": [3.0, 2.0], "spacing": spacing, "gravity": [0.0, -9.81], "walls": "separate"},
         time={"end": 1.4, "frames": frames},
-        bodies=[body | {"shape": {"box": {"min": [0.0, 0.0], "max": [1.0, 1.0]}}} | more],
         solver={"redistribute": redistribute, "precision": "f64"},
     )
 
@@ -308,17 +294,13 @@ def test_two_liquids_have_no_crowds(backend_of: Callable) -> None:
     backend, found = backend_of("f64", 1), {}
     for redistribute in (False, "auto"):
         bodies = [
-            {
-                "name": name,
-                "material": {"law": "fluid", "density": density, "bulk_modulus": 2e5},
-                "shape": {"box": {"min": [low, 0.0], "max": [low + 0.5, 0.40625]}},
-            }
+            block(name, {"law": "fluid", "density": density, "bulk_modulus": 2e5}, [low, 0.0], [low + 0.5, 0.40625])
             for name, density, low in (("salt", 1000.0, 0.0), ("fresh", 800.0, 0.5))
         ]
         scene = scene_of(
+            *bodies,
             domain={"size": [1.0, 0.5], "spacing": 1 / 64, "gravity": [0.0, -9.81], "walls": "slip"},
             time={"end": 2.0, "frames": 4},
-            bodies=bodies,
             solver={"redistribute": redistribute, "precision": "f64"},
         )
         frames = list(build_run(scene, backend).frames())
@@ -354,16 +336,16 @@ def test_a_run_that_goes_on_has_the_same_bytes(backend_of: Callable) -> None:
 def far_apart(dimension: int, grid: str) -> Scene:
     """Return water in two corners of a domain that is nearly empty, sheared, at walls and a face that repeats."""
     d, walls = dimension, {"default": "slip", "x_min": "periodic", "x_max": "periodic"}
-    strip = {"box": {"min": [0.0, 0.0, 0.5][:d], "max": [0.12, 0.12, 0.62][:d]}}
-    corner = {"box": {"min": [0.88, 0.86, 0.6][:d], "max": [1.0, 1.0, 0.7][:d]}}
+    strip = box([0.0, 0.0, 0.5][:d], [0.12, 0.12, 0.62][:d])
+    corner = box([0.88, 0.86, 0.6][:d], [1.0, 1.0, 0.7][:d])
     bodies = [
         {"name": "strip", "shape": strip, "velocity": ["-1.0", "0.5 - 8.0 * X", "-3.0 * Y"][:d]},
         {"name": "corner", "shape": corner, "velocity": ["5.0 * (Y - 0.9)", "1.0", "4.0 * (X - 0.9)"][:d]},
     ]
     return scene_of(
+        *(body | {"material": WATER, "sampling": "jittered"} for body in bodies),
         domain={"size": [1.0] * d, "spacing": 1 / 60 if d == 2 else 1 / 36, "walls": walls},
-        time={"end": 0.18, "frames": 1},
-        bodies=[body | {"material": WATER, "sampling": "jittered"} for body in bodies],
+        end=0.18,
         solver={"precision": "f64", "grid": grid, "kernel": "cubic" if d == 2 else "quadratic"},
     )
 
@@ -399,15 +381,8 @@ def test_a_gpu_shifts_as_the_cpu_does(backend_of: Callable) -> None:
 def test_colliders_hold_particles_back(backend_of: Callable) -> None:
     """None that is outside goes farther than half of the way to the surface, in a shift and on its way back."""
     ball = {"name": "ball", "shape": {"ball": {"center": [0.5, 0.4], "radius": 0.2}}}
-    scene = scene_of(
-        **{
-            "domain": {"size": [1.0, 1.0], "spacing": H, "walls": "slip"},
-            "time": {"end": 1.0, "frames": 1},
-            "bodies": [{"name": "b", "material": WATER, "shape": {"box": {"min": [0, 0], "max": [1, 0.15]}}}],
-            "colliders": [ball],
-            "solver": {"precision": "f64"},
-        }
-    )
+    water, domain = block("b", WATER, [0, 0], [1, 0.15]), {"size": [1.0, 1.0], "spacing": H, "walls": "slip"}
+    scene = scene_of(water, domain=domain, colliders=[ball], precision="f64")
     run = build_run(scene, backend_of("f64", 1))
     rng = np.random.default_rng(1)
     angle, distance = rng.uniform(0, 2 * np.pi, run.groups[0].count), rng.uniform(0, 1, run.groups[0].count) ** 2 / 20

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from drawn_results import JELLY, WATER, frame, header, lattice, write
+from scenes import ball, box
 
 from mpmcli.output import Result
 from mpmcli.render.colliders import FILLED
@@ -19,12 +20,8 @@ pytestmark = pytest.mark.usefixtures("drawing")
 H = 0.05
 LIGHT = THEMES["light"]
 FILL = np.array(rgb_bytes(LIGHT.ground)) * (1 - FILLED) + FILLED * np.array(rgb_bytes(LIGHT.solid))
-TANK = {"name": "tank", "side": "inside", "shape": {"ball": {"center": [0.5, 0.5], "radius": 0.45}}}
-ROD = {
-    "name": "rod",
-    "shape": {"box": {"min": [0.3, 0.55], "max": [0.7, 0.65]}},
-    "angular_velocity": float(50 * np.pi),
-}
+TANK = {"name": "tank", "side": "inside", "shape": ball([0.5, 0.5], 0.45)}
+ROD = {"name": "rod", "shape": box([0.3, 0.55], [0.7, 0.65]), "angular_velocity": float(50 * np.pi)}
 
 
 def drawn(result: Result, mode: str, k: int = 0, camera: str = "front", **more: Any) -> tuple[np.ndarray, View]:
@@ -85,12 +82,8 @@ def test_particles_in_a_flat_collider_are_seen_as_dots(tmp_path: Path) -> None:
 @pytest.mark.parametrize("mode", ["dots", "surface", "fluid"])
 def test_things_hide_what_is_behind_them_and_containers_hide_nothing(tmp_path: Path, mode: str) -> None:
     """Looked at along y: a slab at y < 0.3 stands before the one body, and moves to stand before the other."""
-    slab = {
-        "name": "slab",
-        "shape": {"box": {"min": [0.05, 0.1, 0.05], "max": [0.45, 0.2, 0.95]}},
-        "velocity": [50.0, 0.0, 0.0],
-    }
-    room = {"name": "room", "side": "inside", "shape": {"box": {"min": [0.02] * 3, "max": [0.98] * 3}}}
+    slab = {"name": "slab", "shape": box([0.05, 0.1, 0.05], [0.45, 0.2, 0.95]), "velocity": [50.0, 0.0, 0.0]}
+    room = {"name": "room", "side": "inside", "shape": box([0.02] * 3, [0.98] * 3)}
     facts = header((1.0, 1.0, 1.0), H, [JELLY, JELLY], [slab, room])
     block = lattice((0.15, 0.5, 0.4), (0.35, 0.7, 0.6), H / 2)
     both = np.concatenate([block, block + np.array([0.5, 0.0, 0.0])])
@@ -131,8 +124,8 @@ def test_the_scene_of_a_picture_leaves_out_a_collider_that_cannot_be_read(tmp_pa
 
 def test_a_body_on_a_collider_has_no_edge_there_and_is_not_seen_behind_a_thin_one(tmp_path: Path) -> None:
     """Its particles end a distance from the slab, as solvers keep them, and the picture shows no gap."""
-    slab = {"name": "slab", "shape": {"box": {"min": [0.0, 0.2], "max": [1.0, 0.3]}}}
-    shelf = {"name": "shelf", "shape": {"box": {"min": [0.0, 0.7], "max": [1.0, 0.71]}}}
+    slab = {"name": "slab", "shape": box([0.0, 0.2], [1.0, 0.3])}
+    shelf = {"name": "shelf", "shape": box([0.0, 0.7], [1.0, 0.71])}
     d = H / 2
     block = lattice((0.3, 0.3 + d / 2), (0.7, 0.5), d)
     facts = header((1.0, 1.0), H, [WATER], [slab, shelf])

@@ -105,16 +105,13 @@ def test_materials_and_bodies_have_colours_of_their_own(result: Result, scene: R
         assert (rgb[: N // 2] == rgb_bytes(colors.inks[0])).all() and (rgb[N // 2 :] == rgb_bytes(colors.inks[1])).all()
 
 
-@pytest.mark.parametrize(
-    ("name", "sentence"),
-    [
-        ("volume_ratio", 'stores no "volume_ratio", but velocity, .*add "volume_ratio" to output.fields of the scene'),
-        ("presure", 'did you mean "pressure"'),
-        ("foo", "speed, material, body, id, density, pressure, J and stress have names of their own"),
-        ("velocity.z", 'no component "z"; its components are x and y'),
-        ("density.x", "it is one number"),
-    ],
-)
+@pytest.mark.parametrize(("name", "sentence"), [
+    ("volume_ratio", 'stores no "volume_ratio", but velocity, .*add "volume_ratio" to output.fields of the scene'),
+    ("presure", 'did you mean "pressure"'),
+    ("foo", "speed, material, body, id, density, pressure, J and stress have names of their own"),
+    ("velocity.z", 'no component "z"; its components are x and y'),
+    ("density.x", "it is one number"),
+])  # fmt: skip
 def test_what_is_not_stored_is_named(result: Result, scene: RenderScene, name: str, sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
         color_by(name, result, scene, LIGHT)

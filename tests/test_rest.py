@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from solver_state import scene_of
+from scenes import ball, body, box, plane, polygon, scene_of
 from test_batch import batch_of, outputs_of
 from test_check_frames import header_of
 
@@ -78,7 +78,7 @@ def obstacles(seed: int) -> Scene:
     """
     random = np.random.default_rng(seed)
     x, y, angle = random.uniform(0.3, 0.7), random.uniform(0.3, 0.5), random.uniform(0, 90)
-    disc = {"ball": {"center": [x, y], "radius": random.uniform(0.05, 0.12)}}
+    disc = ball([x, y], random.uniform(0.05, 0.12))
     bar = {"box": {"min": [0.2, 0.3], "max": [0.5, 0.36]}, "rotation": angle}
 
     def rough() -> dict:
@@ -87,23 +87,22 @@ def obstacles(seed: int) -> Scene:
 
     edge = [[0.5, 0.3], [0.8, 0.3], [0.8, 0.7], [0.72, 0.7], [0.72, 0.38], [0.5, 0.38]]
     blobs = [
-        {"ball": {"center": random.uniform([0.2, 0.75], [0.5, 0.85]).tolist(), "radius": 0.1}},
+        ball(random.uniform([0.2, 0.75], [0.5, 0.85]).tolist(), 0.1),
         {"box": {"min": [0.62, 0.75], "max": [0.74, 0.9]}, "rotation": angle},
     ]
+    bodies = [
+        body(f"b{k}", WATER, blob, velocity=random.uniform([-2, -4], [2, 0]).tolist()) for k, blob in enumerate(blobs)
+    ]
     return scene_of(
+        *bodies,
         domain={"size": [1.0, 1.0], "spacing": H, "gravity": ["30 * sign(sin(50 * t))", -G], "walls": "open"},
-        time={"end": 0.3, "frames": 1},
-        solver={"precision": "f64"},
-        bodies=[
-            {"name": f"b{k}", "material": WATER, "shape": blob, "velocity": random.uniform([-2, -4], [2, 0]).tolist()}
-            for k, blob in enumerate(blobs)
-        ],
+        end=0.3,
+        precision="f64",
         colliders=[
-            {"name": "disc", "shape": disc | {"subtract": [{"box": {"min": [x, 0.0], "max": [1.0, y]}}]}} | rough(),
+            {"name": "disc", "shape": disc | {"subtract": [box([x, 0.0], [1.0, y])]}} | rough(),
             {"name": "bar", "shape": bar} | rough(),
-            {"name": "edge", "shape": {"polygon": {"vertices": edge}}, "wall": ["slip", "stick", "separate"][seed % 3]},
-            {"name": "floor", "shape": {"plane": {"point": [0.0, 0.15], "normal": [random.uniform(-0.5, 0.5), 1.0]}}}
-            | rough(),
+            {"name": "edge", "shape": polygon(edge), "wall": ["slip", "stick", "separate"][seed % 3]},
+            {"name": "floor", "shape": plane([0.0, 0.15], [random.uniform(-0.5, 0.5), 1.0])} | rough(),
         ],
     )
 
@@ -136,10 +135,6 @@ def below(outline: list[list[float]], level: float) -> list[list[float]]:
     return found
 
 
-def box(low: list[float], high: list[float]) -> dict:
-    return {"box": {"min": low, "max": high}}
-
-
 def beside(face: float) -> tuple[dict, list[dict]]:
     """Return twenty cells of water beside a collider."""
     return box([0.0, 0.0], [face, 0.4]), [box([face, -0.1], [0.6, 0.9])]
@@ -147,27 +142,27 @@ def beside(face: float) -> tuple[dict, list[dict]]:
 
 def vessels() -> dict[str, tuple[dict, list[dict]]]:
     """Return shapes of water at rest and the colliders around them, in a domain of 0.8 m, by name."""
-    slope = {"plane": {"point": [0.0, 0.1], "normal": [-np.sin(np.radians(20)), np.cos(np.radians(20))]}}
+    slope = plane([0.0, 0.1], [-np.sin(np.radians(20)), np.cos(np.radians(20))])
     wedge = [[0.0, 0.1], [0.8, 0.1 + 0.8 * np.tan(np.radians(20))], [0.8, 0.6], [0.0, 0.6]]
     bevels = [[[-0.1, -0.1], [0.25, -0.1], [-0.1, 0.25]], [[0.55, -0.1], [0.9, -0.1], [0.9, 0.25]]]
     basin = [[0.15, 0.0], [0.65, 0.0], [0.8, 0.15], [0.8, 0.4], [0.0, 0.4], [0.0, 0.15]]
     angles = 2 * np.pi * np.arange(24) / 24 + 0.05
     bowl = (0.4 + 0.35 * np.stack([np.cos(angles), np.sin(angles)], axis=1)).tolist()
     tank = turned([[0.15, 0.15], [0.65, 0.15], [0.65, 0.65], [0.15, 0.65]], 25.0, 0.4)
-    big, small = ({"ball": {"center": [0.4, 0.4], "radius": radius}} for radius in (0.3, 0.15))
-    moat, round_bowl = big | {"subtract": [small]}, {"ball": {"center": [0.41, 0.39], "radius": 0.34}}
+    big, small = (ball([0.4, 0.4], radius) for radius in (0.3, 0.15))
+    moat, round_bowl = big | {"subtract": [small]}, ball([0.41, 0.39], 0.34)
     # Its legs meet half a ring at a face.
     half = big | {"subtract": [small, box([0.0, 0.4], [0.8, 0.8])]}
     legs = [box([x, 0.4], [x + 0.15, 0.8]) for x in (0.1, 0.55)]
     columns = [box([x, 0.4], [x + 0.15, 0.55]) for x in (0.1, 0.55)]
-    disc = {"ball": {"center": [0.41, 0.22], "radius": 0.12}}
+    disc = ball([0.41, 0.22], 0.12)
     floor = box([-0.1, -0.1], [0.9, 0.1033])
     crate, tilted = box([0.28, 0.14], [0.52, 0.3]), box([0.287, 0.146], [0.527, 0.306]) | {"rotation": 20}
     return {
-        "slope": ({"polygon": {"vertices": wedge}}, [slope]),
-        "bevels": ({"polygon": {"vertices": basin}}, [{"polygon": {"vertices": one}} for one in bevels]),
-        "bowl": ({"polygon": {"vertices": below(bowl, 0.4)}}, [{"polygon": {"vertices": bowl}}]),
-        "tank": ({"polygon": {"vertices": below(tank, 0.4)}}, [{"polygon": {"vertices": tank}}]),
+        "slope": (polygon(wedge), [slope]),
+        "bevels": (polygon(basin), [polygon(one) for one in bevels]),
+        "bowl": (polygon(below(bowl, 0.4)), [polygon(bowl)]),
+        "tank": (polygon(below(tank, 0.4)), [polygon(tank)]),
         "round": (round_bowl | {"subtract": [box([0.0, 0.43], [0.8, 0.8])]}, [round_bowl]),
         "moat": ({**big, "subtract": [small, box([0.0, 0.5], [0.8, 0.8])]}, [moat]),
         "tube": ({**columns[0], "add": [columns[1], half]}, [{**legs[0], "add": [legs[1], half]}]),
@@ -191,9 +186,9 @@ def still(name: str) -> Scene:
     water, colliders = vessels()[name]
     how = {"side": "inside" if name in INSIDE else "outside", "friction": 0.01 if name == "round" else 0.0}
     return scene_of(
+        body("water", "water", water) | ({} if name in MOVING else AT_REST),
         domain={"size": [0.8, 0.8], "spacing": H, "gravity": [0.0, -G]},
         time={"end": 2.0, "frames": 40},
-        bodies=[{"name": "water", "material": "water", "shape": water} | ({} if name in MOVING else AT_REST)],
         colliders=[{"name": f"c{k}", "shape": shape} | how for k, shape in enumerate(colliders)],
     )
 

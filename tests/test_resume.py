@@ -15,6 +15,7 @@ from command import SCENE, run_here
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_result import made_frame, made_header, made_row
+from scenes import block, box, collider, liquid, solid, tables_of
 from test_checksums import flip, place_of
 from test_output_frames import make_frame
 from test_output_segments import fill
@@ -33,63 +34,30 @@ from mpmcli.solver.engine.run import Run, build_run
 from mpmcli.solver.engine.saved_state import SavedState
 from mpmcli.solver.machine.backend import choose_backend, start, stop_backend
 
+SAND = {"law": "sand", "density": 1600.0, "youngs_modulus": 2e5, "poissons_ratio": 0.3, "friction_angle": 30.0}
+JELLY = solid(2e5, poissons_ratio=0.3)
 # Sand, water from an emitter, a paddle that turns ever faster, gravity that swings, an open face.
-CHANGING = {
-    "domain": {
-        "size": [1.0, 1.0],
-        "cells": [20, 20],
-        "gravity": ["2*sin(9*t)", -9.81],
-        "walls": {"y_max": "open"},
-    },
-    "time": {"end": 0.4, "frames": 7},
-    "output": {"fields": ["velocity", "density"]},
-    "bodies": [
-        {
-            "name": "sand",
-            "shape": {"box": {"min": [0.1, 0.0], "max": [0.6, 0.2]}},
-            "material": {
-                "law": "sand",
-                "density": 1600.0,
-                "youngs_modulus": 2e5,
-                "poissons_ratio": 0.3,
-                "friction_angle": 30.0,
-            },
-        }
-    ],
-    "emitters": [
-        {
-            "name": "jet",
-            "shape": {"box": {"min": [0.75, 0.7], "max": [0.9, 0.75]}},
-            "velocity": [0.0, -1.5],
-            "material": {"law": "fluid", "density": 1000.0, "bulk_modulus": 2e4, "volume_correction": True},
-        }
-    ],
-    "colliders": [
-        {
-            "name": "paddle",
-            "shape": {"box": {"min": [0.3, 0.25], "max": [0.5, 0.35]}},
-            "wall": "slip",
-            "friction": 0.3,
-            "velocity": [0.3, "-0.5 + t"],
-            "angular_velocity": "20*t",
-        }
-    ],
-}
+PADDLE = {"wall": "slip", "friction": 0.3, "velocity": [0.3, "-0.5 + t"], "angular_velocity": "20*t"}
+CHANGING = tables_of(
+    block("sand", SAND, [0.1, 0.0], [0.6, 0.2]),
+    domain={"size": [1.0, 1.0], "cells": [20, 20], "gravity": ["2*sin(9*t)", -9.81], "walls": {"y_max": "open"}},
+    time={"end": 0.4, "frames": 7},
+    fields=["velocity", "density"],
+    emitters=[block("jet", liquid(2e4, volume_correction=True), [0.75, 0.7], [0.9, 0.75], velocity=[0.0, -1.5])],
+    colliders=[collider("paddle", box([0.3, 0.25], [0.5, 0.35]), **PADDLE)],
+    contact={},
+)
 # Two elastic bodies that collide on grids of their own.
-TOTAL = {
-    "domain": {"size": [1.0, 1.0], "cells": [16, 16]},
-    "time": {"end": 0.1, "frames": 4},
-    "solver": {"solids": "total"},
-    "bodies": [
-        {
-            "name": f"block {k}",
-            "shape": {"box": {"min": [0.1 + 0.5 * k, 0.3], "max": [0.4 + 0.5 * k, 0.6]}},
-            "velocity": [2.0 - 4.0 * k, 0.0],
-            "material": {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 2e5, "poissons_ratio": 0.3},
-        }
+TOTAL = tables_of(
+    *(
+        block(f"block {k}", JELLY, [0.1 + 0.5 * k, 0.3], [0.4 + 0.5 * k, 0.6], velocity=[2.0 - 4.0 * k, 0.0])
         for k in range(2)
-    ],
-}
+    ),
+    domain={"size": [1.0, 1.0], "cells": [16, 16]},
+    time={"end": 0.1, "frames": 4},
+    solids="total",
+    contact={},
+)
 # Stops at the n-th point where a run can stop, by SIGKILL.
 KILLED = """
 import os, signal, sys
@@ -263,16 +231,13 @@ def find(whole: Path, directory: Path, *overrides: str) -> object:
     return find_resumption(load_scene(whole / "drop.toml", overrides, laws=parameter_models()), directory)
 
 
-@pytest.mark.parametrize(
-    ("overrides", "part"),
-    [
-        (["time.safety=0.3"], "time.safety was"),
-        (["bodies.drop.material.density=900.0"], "bodies[0].material.density was 1000.0 and is 900.0"),
-        (["output.fields=['velocity']"], "output.fields"),
-        (["time.frames=8"], "may only grow, both by the same factor"),
-        (["time.end=0.025", "time.frames=2"], "may only grow, both by the same factor"),
-    ],
-)
+@pytest.mark.parametrize(("overrides", "part"), [
+    (["time.safety=0.3"], "time.safety was"),
+    (["bodies.drop.material.density=900.0"], "bodies[0].material.density was 1000.0 and is 900.0"),
+    (["output.fields=['velocity']"], "output.fields"),
+    (["time.frames=8"], "may only grow, both by the same factor"),
+    (["time.end=0.025", "time.frames=2"], "may only grow, both by the same factor"),
+])  # fmt: skip
 def test_another_scene_is_refused_with_the_keys_that_differ(whole, overrides, part):
     with pytest.raises(InputError) as error:
         find(whole, whole / "packed", *overrides)

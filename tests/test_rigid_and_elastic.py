@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from solver_state import scene_of
+from scenes import ball, block, body, box, scene_of, slow
 from test_deterministic import on_gpu_path
 from test_gpu_path import after_steps, check_same
 
@@ -29,32 +29,24 @@ def bar(cells: int, density: float, speed: float) -> Scene:
     """Return a bar of some cells, 0.5 m long, with one end on a wall, and a rigid mass that meets the other end."""
     h, long = 0.5 / cells, 0.5 / np.sqrt(JELLY["youngs_modulus"] / JELLY["density"])
     return scene_of(
+        block("bar", JELLY | {"poissons_ratio": 0.0}, [0.0, 0.0], [0.5, 8 * h]),
         domain={"size": [1.0, 8 * h], "spacing": h, "walls": {"default": "slip", "x_min": "separate"}},
         time={"end": 0.5 * h / speed + 6 * long, "frames": 60},
-        bodies=[
-            {
-                "name": "bar",
-                "material": JELLY | {"poissons_ratio": 0.0},
-                "shape": {"box": {"min": [0.0, 0.0], "max": [0.5, 8 * h]}},
-            }
-        ],
         colliders=[
             {
                 "name": "mass",
                 "density": density,
                 "fixed": ["y", "rotation"],
-                "shape": {"box": {"min": [0.5 + 0.5 * h, 0.0], "max": [0.75, 8 * h]}},
+                "shape": box([0.5 + 0.5 * h, 0.0], [0.75, 8 * h]),
                 "velocity": [-speed, 0.0],
             }
         ],
         contact={},
-        solver={"precision": "f64"},
+        precision="f64",
     )
 
 
-@pytest.mark.parametrize(
-    ("cells", "share"), [(16, 0.005), (16, 0.025), pytest.param(32, 0.025, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize(("cells", "share"), [(16, 0.005), (16, 0.025), slow(32, 0.025)])
 def test_a_mass_leaves_a_bar_with_the_speed_of_st_venant(backend_of: Callable, cells: int, share: float) -> None:
     """Of equal mass: with 0.688 of its speed, to the first order in the cells; energy falls by waves that they lose.
 
@@ -83,30 +75,17 @@ def discs(dimension: int, speed: float, density: float = 1000.0, **domain: objec
     d, radius, h = dimension, 0.1, 0.0125 if dimension == 2 else 0.02
     tail = [0.3] * (d - 2)
     return scene_of(
+        body("ball", JELLY, ball([0.3, 0.3, *tail], radius), velocity=[speed, *[0.0] * (d - 1)]),
         domain={"size": [0.9, 0.8, 0.6][:d], "spacing": h} | domain,
         time={"end": 0.3 / speed, "frames": 20},
-        bodies=[
-            {
-                "name": "ball",
-                "material": JELLY,
-                "shape": {"ball": {"center": [0.3, 0.3, *tail], "radius": radius}},
-                "velocity": [speed, *[0.0] * (d - 1)],
-            }
-        ],
-        colliders=[
-            {
-                "name": "other",
-                "density": density,
-                "shape": {"ball": {"center": [0.48, 0.4, *tail], "radius": radius}},
-            }
-        ],
+        colliders=[{"name": "other", "density": density, "shape": ball([0.48, 0.4, *tail], radius)}],
         contact={},
-        output={"fields": ["velocity", "stress"]},
-        solver={"precision": "f64"},
+        fields=["velocity", "stress"],
+        precision="f64",
     )
 
 
-@pytest.mark.parametrize("dimension", [2, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("dimension", [2, slow(3)])
 def test_a_ball_that_hits_a_rigid_one_off_its_centre(backend_of: Callable, dimension: int) -> None:
     """The rigid one leaves along the normal, without spin; momentum is kept to rounding, and energy but for 7 %.
 
@@ -137,15 +116,15 @@ def test_a_gpu_does_the_same(backend_of: Callable) -> None:
 
 def test_a_box_lies_on_jelly(backend_of: Callable) -> None:
     """With its weight, and level, while it swings less and less."""
-    shape = {"box": {"min": [0.3, 0.2], "max": [0.5, 0.3]}}
-    jelly = {"name": "jelly", "material": JELLY, "shape": {"box": {"min": [0.2, 0.0], "max": [0.6, 0.2]}}}
+    shape = box([0.3, 0.2], [0.5, 0.3])
+    jelly = block("jelly", JELLY, [0.2, 0.0], [0.6, 0.2])
     scene = scene_of(
+        jelly,
         domain={"size": [0.9, 0.8], "spacing": 0.0125, "gravity": [0.0, -G]},
         time={"end": 3.0, "frames": 30},
-        bodies=[jelly],
         colliders=[{"name": "box", "density": 500.0, "shape": shape, "friction": 0.5}],
         contact={},
-        solver={"precision": "f64"},
+        precision="f64",
     )
     rows = rows_of(scene, backend_of("f64", 1))
     weight = scene.colliders[0].moments.mass * G

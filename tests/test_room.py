@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from solver_state import scene_of
+from scenes import ball, block, body, box, liquid, scene_of, solid
 
 from mpmcli.solver.engine import kernel_store
 from mpmcli.solver.engine.resolved import Resolved
@@ -51,19 +51,10 @@ SCENE = {
     "time": {"end": 0.002, "frames": 1},
     "output": {"fields": ["velocity"]},
     "bodies": [
-        {
-            "name": "water",
-            "material": {"law": "fluid", "density": 1000.0, "bulk_modulus": 1e5, "viscosity": 0.1},
-            "shape": {"box": {"min": [0.1, 0.1], "max": [0.8, 0.6]}},
-            "velocity": [0.1, 0.0],
-        },
-        {
-            "name": "ball",
-            "material": {"law": "neo_hookean", "density": 800.0, "youngs_modulus": 1e5},
-            "shape": {"ball": {"center": [1.3, 0.9], "radius": 0.21}},
-        },
+        block("water", liquid(1e5, viscosity=0.1), [0.1, 0.1], [0.8, 0.6], velocity=[0.1, 0.0]),
+        body("ball", solid(1e5, density=800.0), ball([1.3, 0.9], 0.21)),
     ],
-    "colliders": [{"name": "stone", "shape": {"ball": {"center": [1.0, 0.2], "radius": 0.1}}}],
+    "colliders": [{"name": "stone", "shape": ball([1.0, 0.2], 0.1)}],
 }
 
 
@@ -80,7 +71,7 @@ def set_(*path: str | int, to: object) -> Callable[[dict], None]:
 
 def stones(count: int) -> Callable[[dict], None]:
     """Return an edit to so many colliders."""
-    shapes = [{"ball": {"center": [0.9 + 0.2 * k, 0.2], "radius": 0.05}} for k in range(count)]
+    shapes = [ball([0.9 + 0.2 * k, 0.2], 0.05) for k in range(count)]
     return set_("colliders", to=[{"name": f"stone {k}", "shape": shape} for k, shape in enumerate(shapes)])
 
 
@@ -89,7 +80,7 @@ EDITS = {
     "size of a box": set_("bodies", 0, "shape", "box", "max", to=[0.81, 0.6]),
     "place of a ball": set_("bodies", 1, "shape", "ball", "center", to=[1.4, 0.8]),
     "radius of a ball": set_("bodies", 1, "shape", "ball", "radius", to=0.205),
-    "shape of a body": set_("bodies", 1, "shape", to={"box": {"min": [1.1, 0.7], "max": [1.45, 1.07]}}),
+    "shape of a body": set_("bodies", 1, "shape", to=box([1.1, 0.7], [1.45, 1.07])),
     "velocity": set_("bodies", 0, "velocity", to=[0.0, 0.3]),
     "density": set_("bodies", 1, "material", "density", to=900.0),
     "modulus": set_("bodies", 1, "material", "youngs_modulus", to=2e5),

@@ -158,11 +158,7 @@ def status_on_disk(directory: Path) -> str:
 
 @pytest.mark.parametrize(
     ("fault", "status", "frames"),
-    [
-        (None, "finished", 3),
-        (KeyboardInterrupt(), "interrupted", 2),
-        (RunError("The disk is full."), "failed", 2),
-    ],
+    [(None, "finished", 3), (KeyboardInterrupt(), "interrupted", 2), (RunError("The disk is full."), "failed", 2)],
     ids=["nothing", "Ctrl-C", "disk"],
 )
 def test_a_run_ends_in_order_whatever_happens(run, tmp_path, fault, status, frames):
@@ -182,25 +178,20 @@ def test_a_fault_of_ours_leaves_no_run_that_seems_to_go_on(run, tmp_path):
     assert open_result(tmp_path / "result").frame_count == 2
 
 
-def test_ctrl_c_while_packing_leaves_the_segments(run, tmp_path, monkeypatch):
-    def interrupted(self: SegmentStore, stop: Callable[[], bool]) -> None:
-        raise KeyboardInterrupt
+@pytest.mark.parametrize(
+    ("error", "status", "said"),
+    [(KeyboardInterrupt(), "interrupted", "packed"), (RunError("The disk has no room."), "failed", "no room")],
+    ids=["interrupted", "failed"],
+)
+def test_a_run_that_cannot_be_packed_says_so_and_leaves_its_segments(run, tmp_path, monkeypatch, error, status, said):
+    def finish(self: SegmentStore, stop: Callable[[], bool]) -> None:
+        raise error
 
-    monkeypatch.setattr(SegmentStore, "finish", interrupted)
+    monkeypatch.setattr(SegmentStore, "finish", finish)
     summary = run(None)
-    assert summary.status == "interrupted" and "packed" in summary.message
+    assert summary.status == status_on_disk(tmp_path / "result") == status and said in summary.message
     assert summary.path == tmp_path / "result"
     assert open_result(summary.path).frame_count == 3
-
-
-def test_a_run_that_cannot_be_packed_says_so(run, tmp_path, monkeypatch):
-    def full(self: SegmentStore, stop: Callable[[], bool]) -> None:
-        raise RunError("The disk has no room for the packed file.")
-
-    monkeypatch.setattr(SegmentStore, "finish", full)
-    summary = run(None)
-    assert summary.status == "failed" and "no room" in summary.message
-    assert status_on_disk(tmp_path / "result") == "failed"
 
 
 def test_every_frame_is_reported(run):

@@ -9,7 +9,7 @@ import taichi as ti
 from law_probe import LawProbe, Probes, Response, assert_finite, stretched, wild
 from law_tangent import largest_stiffness
 from pydantic import ValidationError
-from solver_state import scene_of
+from scenes import body, scene_of
 
 from mpmcli.materials.law import StateBound
 from mpmcli.materials.sand import BEHIND, REAL_MODULUS, Sand, SandParameters
@@ -336,8 +336,8 @@ def test_a_heap_says_its_friction_angle() -> None:
     assert math.sin(math.radians(parameters.friction_angle)) == pytest.approx(1 / math.sqrt(3), rel=1e-12)
     assert SandParameters.model_validate(parameters.model_dump()) == parameters
     box = {"box": {"min": [0.0, 0.0], "max": [0.5, 0.5]}}
-    heap = {"name": "heap", "material": {"preset": "sand", "repose_angle": 30.0}, "shape": box}
-    scene = scene_of(domain={"size": [1.0, 1.0], "spacing": 0.1}, time={"end": 1.0, "frames": 1}, bodies=[heap])
+    heap = body("heap", {"preset": "sand", "repose_angle": 30.0}, box)
+    scene = scene_of(heap, domain={"size": [1.0, 1.0], "spacing": 0.1})
     assert scene.bodies[0].material.friction_angle == parameters.friction_angle
     with pytest.raises(ValidationError, match="sets friction_angle, which is given as well"):
         sand(repose_angle=30.0, friction_angle=30.0)

@@ -10,13 +10,8 @@ from mpmcli.scene import Scene, load_scene, scene_to_toml
 
 BASE = """\
 title = "two"
-[domain]
-size = [4.0, 2.0]
-spacing = 0.01
-gravity = [0.0, -9.81]
-[time]
-end = 1.5
-frames = 150
+domain = { size = [4.0, 2.0], spacing = 0.01, gravity = [0.0, -9.81] }
+time = { end = 1.5, frames = 150 }
 [[bodies]]
 name = "column"
 material = "water"
@@ -91,19 +86,16 @@ def test_files_are_found_where_the_base_is(scene, tmp_path: Path) -> None:
     assert len(scene('base = "inner/base.toml"\n').bodies[1].shape.form.position) == 2
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ('remove = ["drop"]\n', "base: missing key: the scene whose names `remove` leaves out"),
-        ("base = 3\n", "base: must be the path of a scene in quotes; found 3"),
-        ('base = "a\\u0000b"\n', "base: must be the path of a scene in quotes; found 'a\\x00b'"),
-        ('base = "nowhere.toml"\n', "there is no such file"),
-        ('base = "scene.toml"\n', "base: scene.toml has this scene as its base in turn"),
-        ('base = "base.toml"\nremove = ["dorp"]\n', 'remove: nothing has the name "dorp"; did you mean "drop"?'),
-        ('base = "base.toml"\nremove = "drop"\n', "remove: must be a list of names in quotes; found 'drop'"),
-        ('base = "base.toml"\n[time]\nend = -1\n', "time.end: must be greater than 0; found -1"),
-    ],
-)
+@pytest.mark.parametrize(("text", "said"), [
+    ('remove = ["drop"]\n', "base: missing key: the scene whose names `remove` leaves out"),
+    ("base = 3\n", "base: must be the path of a scene in quotes; found 3"),
+    ('base = "a\\u0000b"\n', "base: must be the path of a scene in quotes; found 'a\\x00b'"),
+    ('base = "nowhere.toml"\n', "there is no such file"),
+    ('base = "scene.toml"\n', "base: scene.toml has this scene as its base in turn"),
+    ('base = "base.toml"\nremove = ["dorp"]\n', 'remove: nothing has the name "dorp"; did you mean "drop"?'),
+    ('base = "base.toml"\nremove = "drop"\n', "remove: must be a list of names in quotes; found 'drop'"),
+    ('base = "base.toml"\n[time]\nend = -1\n', "time.end: must be greater than 0; found -1"),
+])  # fmt: skip
 def test_each_bad_one_has_its_sentence(scene, text: str, said: str) -> None:
     with pytest.raises(InputError) as error:
         scene(text)

@@ -3,38 +3,20 @@
 import math
 
 import pytest
+import scenes
+from scenes import ball, box, polygon
 
 from mpmcli.errors import InputError
-from mpmcli.materials.registry import parameter_models
-from mpmcli.scene import parse_scene, scene_bounds
+from mpmcli.scene import scene_bounds
 
 JELLY = {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 1e5}
 
 
 def scene_of(*shapes, size=(4.0, 4.0), velocity=None, body=None, **domain):
-    data = {
-        "domain": {"size": list(size), "spacing": 0.1, **domain},
-        "time": {"end": 1.0, "frames": 1},
-        "bodies": [
-            {"name": f"b{i}", "material": JELLY, "shape": shape, **(body or {})} for i, shape in enumerate(shapes)
-        ],
-    }
+    bodies = [scenes.body(f"b{i}", JELLY, shape, **(body or {})) for i, shape in enumerate(shapes)]
     if velocity:
-        data["bodies"][0]["velocity"] = velocity
-    return parse_scene(data, laws=parameter_models()).scene
-
-
-def box(*corners):
-    d = len(corners) // 2
-    return {"box": {"min": list(corners[:d]), "max": list(corners[d:])}}
-
-
-def ball(*center, radius):
-    return {"ball": {"center": list(center), "radius": radius}}
-
-
-def polygon(*vertices):
-    return {"polygon": {"vertices": [list(v) for v in vertices]}}
+        bodies[0]["velocity"] = velocity
+    return scenes.scene_of(*bodies, size=list(size), spacing=0.1, contact={}, **domain)
 
 
 def cylinder(base, axis, radius, height):
@@ -42,25 +24,22 @@ def cylinder(base, axis, radius, height):
 
 
 TOUCHING = {
-    "boxes": (box(0, 0, 1, 1), box(1, 0, 2, 1)),
-    "boxes, up to round-off": (box(0, 0, 0.3, 1), box(0.1 + 0.2, 0, 2, 1), box(0.1 * 3, 1, 2, 2)),
-    "box and ball": (box(0, 0, 1, 1), ball(1.5, 0.5, radius=0.5)),
-    "balls": (ball(1, 1, radius=0.5), ball(1 + math.sqrt(0.5), 1 + math.sqrt(0.5), radius=0.5)),
-    "ball in a notch": (
-        polygon((0, 0), (2, 0), (1, 1), (2, 2), (0, 2)),
-        ball(2.0, 1.0, radius=math.sqrt(0.5)),
-    ),
-    "triangles of a square": (polygon((0, 0), (2, 0), (2, 2)), polygon((0, 0), (2, 2), (0, 2))),
-    "cylinder on a box": (box(0, 0, 0, 1, 1, 1), cylinder([0.5, 0.5, 1], [0, 0, 1], 0.5, 1)),
+    "boxes": (box([0, 0], [1, 1]), box([1, 0], [2, 1])),
+    "boxes, up to round-off": (box([0, 0], [0.3, 1]), box([0.1 + 0.2, 0], [2, 1]), box([0.1 * 3, 1], [2, 2])),
+    "box and ball": (box([0, 0], [1, 1]), ball([1.5, 0.5], 0.5)),
+    "balls": (ball([1, 1], 0.5), ball([1 + math.sqrt(0.5), 1 + math.sqrt(0.5)], 0.5)),
+    "ball in a notch": (polygon([(0, 0), (2, 0), (1, 1), (2, 2), (0, 2)]), ball([2.0, 1.0], math.sqrt(0.5))),
+    "triangles of a square": (polygon([(0, 0), (2, 0), (2, 2)]), polygon([(0, 0), (2, 2), (0, 2)])),
+    "cylinder on a box": (box([0, 0, 0], [1, 1, 1]), cylinder([0.5, 0.5, 1], [0, 0, 1], 0.5, 1)),
 }
 OVERLAPPING = {
-    "boxes, barely": (box(0, 0, 1, 1), box(0.999, 0.999, 2, 2)),
-    "one inside the other": (box(0, 0, 3, 3), ball(1.5, 1.5, radius=0.1)),
-    "balls": (ball(1, 1, radius=0.5), ball(1.9, 1, radius=0.5)),
-    "ball in a notch": (polygon((0, 0), (2, 0), (1, 1), (2, 2), (0, 2)), ball(1.9, 1.0, radius=0.8)),
-    "equal": (ball(1, 1, radius=0.5), ball(1, 1, radius=0.5)),
-    "crossing bars": (box(1, 1.9, 3, 2.1), polygon((1.9, 1), (2.1, 1), (2.1, 3), (1.9, 3))),
-    "cylinder in a box": (box(0, 0, 0, 1, 1, 1), cylinder([0.5, 0.5, 0.95], [0, 0, 1], 0.5, 1)),
+    "boxes, barely": (box([0, 0], [1, 1]), box([0.999, 0.999], [2, 2])),
+    "one inside the other": (box([0, 0], [3, 3]), ball([1.5, 1.5], 0.1)),
+    "balls": (ball([1, 1], 0.5), ball([1.9, 1], 0.5)),
+    "ball in a notch": (polygon([(0, 0), (2, 0), (1, 1), (2, 2), (0, 2)]), ball([1.9, 1.0], 0.8)),
+    "equal": (ball([1, 1], 0.5), ball([1, 1], 0.5)),
+    "crossing bars": (box([1, 1.9], [3, 2.1]), polygon([(1.9, 1), (2.1, 1), (2.1, 3), (1.9, 3)])),
+    "cylinder in a box": (box([0, 0, 0], [1, 1, 1]), cylinder([0.5, 0.5, 0.95], [0, 0, 1], 0.5, 1)),
 }
 
 
@@ -85,17 +64,17 @@ def test_overlap_names_both_bodies(name):
 
 def test_every_pair_that_overlaps_is_named():
     with pytest.raises(InputError) as refused:
-        scene_of(box(0, 0, 1, 1), box(2, 0, 3, 1), box(0.5, 0, 2.5, 1))
+        scene_of(box([0, 0], [1, 1]), box([2, 0], [3, 1]), box([0.5, 0], [2.5, 1]))
     assert len(str(refused.value).splitlines()) == 2
 
 
 @pytest.mark.parametrize(
     ("shape", "faces"),
     [
-        (box(-0.5, 1, 1, 2), ["x_min by 0.5 m"]),
-        (box(1, 1, 2, 4.25), ["y_max by 0.25 m"]),
-        (ball(1, 1, radius=2), ["x_min by 1 m", "y_min by 1 m"]),
-        (polygon((0, 0), (5, 0), (0, 6)), ["x_max by 1 m", "y_max by 2 m"]),
+        (box([-0.5, 1], [1, 2]), ["x_min by 0.5 m"]),
+        (box([1, 1], [2, 4.25]), ["y_max by 0.25 m"]),
+        (ball([1, 1], 2), ["x_min by 1 m", "y_min by 1 m"]),
+        (polygon([(0, 0), (5, 0), (0, 6)]), ["x_max by 1 m", "y_max by 2 m"]),
     ],
 )
 def test_a_body_outside_names_face_and_distance(shape, faces):
@@ -107,30 +86,30 @@ def test_a_body_outside_names_face_and_distance(shape, faces):
 
 
 def test_the_origin_moves_the_domain():
-    scene_of(box(-2, -2, 2, 2), origin=[-2.0, -2.0])
+    scene_of(box([-2, -2], [2, 2]), origin=[-2.0, -2.0])
     with pytest.raises(InputError, match="x_min by 1 m"):
-        scene_of(box(-3, -2, 2, 2), origin=[-2.0, -2.0])
+        scene_of(box([-3, -2], [2, 2]), origin=[-2.0, -2.0])
 
 
 def test_a_body_may_reach_the_wall_up_to_round_off():
     # 0.2 + 0.4 is a little more than 0.6.
-    scene_of(box(0, 0, 0.2 + 0.4, 0.6), size=(0.6, 0.6))
+    scene_of(box([0, 0], [0.2 + 0.4, 0.6]), size=(0.6, 0.6))
 
 
 def test_a_domain_has_room_between_its_walls():
     with pytest.raises(InputError, match="makes 4 cells along y, and opposite walls need at least 5 between them"):
-        scene_of(box(0, 0, 0.1, 0.1), size=(1.0, 0.4))
+        scene_of(box([0, 0], [0.1, 0.1]), size=(1.0, 0.4))
 
 
 def test_the_speed_of_a_fall():
-    bounds = scene_bounds(scene_of(box(1, 2, 2, 3), gravity=[0.0, -10.0], velocity=[3.0, 4.0]))
+    bounds = scene_bounds(scene_of(box([1, 2], [2, 3]), gravity=[0.0, -10.0], velocity=[3.0, 4.0]))
     assert (bounds.dimension, bounds.spacing, bounds.gravity) == (2, 0.1, 10.0)
     assert bounds.height == pytest.approx(3.0)
     assert bounds.speed == pytest.approx(math.sqrt(25 + 2 * 10 * 3))
 
 
 def test_gravity_in_any_direction_measures_from_the_corner_it_points_to():
-    bounds = scene_bounds(scene_of(box(-2, -2, -1, -1), origin=[-2.0, -2.0], gravity=[6.0, 8.0]))
+    bounds = scene_bounds(scene_of(box([-2, -2], [-1, -1]), origin=[-2.0, -2.0], gravity=[6.0, 8.0]))
     # The corner (2, 2) is lowest, the corner (-2, -2) of the box highest.
     assert bounds.gravity == pytest.approx(10.0)
     assert bounds.height == pytest.approx(4 * 0.6 + 4 * 0.8)
@@ -138,7 +117,7 @@ def test_gravity_in_any_direction_measures_from_the_corner_it_points_to():
 
 def test_without_gravity_only_the_initial_speed_counts():
     scene = scene_of(
-        ball(0, 0, radius=1.0),
+        ball([0, 0], 1.0),
         origin=[-2.0, -2.0],
         body={"velocity_gradient": [[-1.0, 0.0], [0.0, 1.0]], "velocity": [1.0, 0.0]},
     )
@@ -146,4 +125,4 @@ def test_without_gravity_only_the_initial_speed_counts():
     # At the corner (-1, 1) of the bounding box: v = (1 + 1, 1).
     assert bounds.speed == pytest.approx(math.sqrt(5))
     assert bounds.gravity == 0 and bounds.height == pytest.approx(2.0)
-    assert scene_bounds(scene_of(box(0, 0, 1, 1))).speed == 0.0
+    assert scene_bounds(scene_of(box([0, 0], [1, 1]))).speed == 0.0

@@ -6,23 +6,23 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from solver_state import scene_of
+from scenes import ball, body, box, plane, polygon, scene_of
 
 from mpmcli.errors import InputError
 from mpmcli.scene import Scene
 from mpmcli.solver.engine.plan import make_plan
 from mpmcli.solver.machine.backend import Backend
 
-BALL = {"ball": {"center": [0.5, 0.5], "radius": 0.1}}
+BALL = ball([0.5, 0.5], 0.1)
 
 
 def scene(*colliders: dict, dimension: int = 2, end: float = 2.0, **tables: object) -> Scene:
     """Return a small block in a corner, with these colliders."""
     box = {"min": [0.0] * dimension, "max": [0.1] * dimension}
     return scene_of(
+        body("a", "jelly", {"box": box}),
         domain={"size": [1.0] * dimension, "spacing": 0.05},
-        time={"end": end, "frames": 1},
-        bodies=[{"name": "a", "material": "jelly", "shape": {"box": box}}],
+        end=end,
         colliders=[{"name": f"c{k}", "shape": BALL} | table for k, table in enumerate(colliders)],
         **tables,
     )
@@ -53,7 +53,7 @@ def test_keyframes_are_joined_by_straight_lines() -> None:
 
 def test_a_point_keeps_its_distance_as_the_collider_moves() -> None:
     """Distances are those of the start, of points that are taken along; 3D, about an axis across the grid."""
-    shape = {"box": {"min": [0.4, 0.4, 0.3], "max": [0.6, 0.5, 0.7]}}
+    shape = box([0.4, 0.4, 0.3], [0.6, 0.5, 0.7])
     moves = {"velocity": [0.1, "0.2*t", 0.0], "angular_velocity": "1 + t", "axis": [1, 2, -1], "pivot": [0.4, 0.5, 0.5]}
     collider = scene({"shape": shape} | moves, dimension=3).colliders[0]
     points = np.random.default_rng(0).uniform(0.2, 0.8, (100, 3))
@@ -72,41 +72,33 @@ def test_a_point_keeps_its_distance_as_the_collider_moves() -> None:
 
 
 def test_a_container_has_its_material_inside() -> None:
-    outside, inside = scene({}, {"side": "inside", "shape": {"ball": {"center": [0.5, 0.5], "radius": 0.8}}}).colliders
+    outside, inside = scene({}, {"side": "inside", "shape": ball([0.5, 0.5], 0.8)}).colliders
     assert outside.signed_distance(np.array([[0.5, 0.9]])) == pytest.approx([0.3])
     assert inside.signed_distance(np.array([[0.5, 0.9]])) == pytest.approx([0.4])
 
 
-@pytest.mark.parametrize(
-    ("collider", "said"),
-    [
-        ({"wall": "sticky"}, "colliders[0].wall"),
-        ({"wall": "open"}, 'colliders[0].wall: must be "slip", "stick", "separate" or "hold"'),
-        ({"wall": "stick", "friction": 0.2}, "colliders[0].friction: is for a surface that slips or separates"),
-        ({"friction": -1}, "colliders[0].friction: must be at least 0"),
-        ({"velocity": [1.0, 0.0], "offset": ["t", 0.0]}, 'colliders[0].offset: "velocity" is given as well'),
-        ({"angular_velocity": 1.0, "angle": "t"}, 'colliders[0].angle: "angular_velocity" is given as well'),
-        ({"velocity": [1.0, 0.0], "keyframes": [{"time": 0.0}]}, 'colliders[0].keyframes: "velocity" is given as well'),
-        ({"keyframes": [{"time": 1.0}, {"time": 1.0}]}, "colliders[0].keyframes: must have times that rise"),
-        ({"axis": [0, 0, 1]}, "colliders[0].axis: is for 3D scenes"),
-        ({"offset": ["floor(3*t)", 0.0]}, "colliders[0].offset[0]: jumps between 0 and time.end"),
-        ({"velocity": ["1/t", 0.0]}, "colliders[0].velocity[0]: must be finite from time 0 to time.end"),
-        ({"angle": "log(t)"}, "colliders[0].angle: must be finite"),
-        ({"shape": {}}, "colliders[0].shape: needs exactly one of"),
-        ({"shape": {"plane": {"point": [0, 0], "normal": [0, 0]}}}, "must have a direction"),
-        (
-            {"shape": {"plane": {"point": [0, 0], "normal": [0, 1]}, "subtract": [BALL]}},
-            "colliders[0].shape.plane: is a shape alone; leave add and subtract out",
-        ),
-        ({"shape": {"ball": {"center": [50.0, 0.5], "radius": 10.0}}}, '"c0" (20 x 20 m) lies outside of the domain'),
-        (
-            {"shape": {"polygon": {"vertices": [[0, -1e9], [0.1, -1e9], [0.1, 0.1]]}}},
-            '"c0" spans 6e+10 cells, and 1e+08 is the most',
-        ),
-        ({"shape": {"ball": {"center": [0.0, 0.0], "radius": 0.08}}}, 'body "a" overlaps collider "c0" at the start'),
-        ({"speed": 1.0}, "colliders[0].speed"),
-    ],
-)
+@pytest.mark.parametrize(("collider", "said"), [
+    ({"wall": "sticky"}, "colliders[0].wall"),
+    ({"wall": "open"}, 'colliders[0].wall: must be "slip", "stick", "separate" or "hold"'),
+    ({"wall": "stick", "friction": 0.2}, "colliders[0].friction: is for a surface that slips or separates"),
+    ({"friction": -1}, "colliders[0].friction: must be at least 0"),
+    ({"velocity": [1.0, 0.0], "offset": ["t", 0.0]}, 'colliders[0].offset: "velocity" is given as well'),
+    ({"angular_velocity": 1.0, "angle": "t"}, 'colliders[0].angle: "angular_velocity" is given as well'),
+    ({"velocity": [1.0, 0.0], "keyframes": [{"time": 0.0}]}, 'colliders[0].keyframes: "velocity" is given as well'),
+    ({"keyframes": [{"time": 1.0}, {"time": 1.0}]}, "colliders[0].keyframes: must have times that rise"),
+    ({"axis": [0, 0, 1]}, "colliders[0].axis: is for 3D scenes"),
+    ({"offset": ["floor(3*t)", 0.0]}, "colliders[0].offset[0]: jumps between 0 and time.end"),
+    ({"velocity": ["1/t", 0.0]}, "colliders[0].velocity[0]: must be finite from time 0 to time.end"),
+    ({"angle": "log(t)"}, "colliders[0].angle: must be finite"),
+    ({"shape": {}}, "colliders[0].shape: needs exactly one of"),
+    ({"shape": plane([0, 0], [0, 0])}, "must have a direction"),
+    ({"shape": {"plane": {"point": [0, 0], "normal": [0, 1]}, "subtract": [BALL]}},
+     "colliders[0].shape.plane: is a shape alone; leave add and subtract out"),
+    ({"shape": ball([50.0, 0.5], 10.0)}, '"c0" (20 x 20 m) lies outside of the domain'),
+    ({"shape": polygon([[0, -1e9], [0.1, -1e9], [0.1, 0.1]])}, '"c0" spans 6e+10 cells, and 1e+08 is the most'),
+    ({"shape": ball([0.0, 0.0], 0.08)}, 'body "a" overlaps collider "c0" at the start'),
+    ({"speed": 1.0}, "colliders[0].speed"),
+])  # fmt: skip
 def test_faults_are_named(collider: dict, said: str) -> None:
     with pytest.raises(InputError) as caught:
         scene(collider)
@@ -146,7 +138,7 @@ def test_colliders_need_names_of_their_own_and_solids_that_know_them() -> None:
     ],
 )
 def test_a_rate_that_is_a_vector_names_the_axis(dimension: int, table: dict, fault: str) -> None:
-    shape = {"ball": {"center": [0.5] * dimension, "radius": 0.1}}
+    shape = ball([0.5] * dimension, 0.1)
     with pytest.raises(InputError, match=fault):
         scene({"shape": shape} | table, dimension=dimension)
 

@@ -76,26 +76,23 @@ def test_the_effective_scene_is_the_same_scene() -> None:
     assert "constants" not in scene_to_toml(plain)
 
 
-@pytest.mark.parametrize(
-    ("right", "wrong", "said"),
-    [
-        ('["swirl"', '["swirrl"', 'forces[0].acceleration[0]: has an unknown name "swirrl"; did you mean "swirl"?'),
-        ('"0.1 * ramp"', '"swirl"', 'domain.gravity[0]: uses "swirl", which depends on "x"; the names here are t'),
-        ("depth = 0.3", "depth = 0.3\npi = 3", "constants.pi: has a meaning in every expression already"),
-        ("depth = 0.3", "depth = 0.3\nmin = 3", "constants.min: has a meaning in every expression already"),
-        ("depth = 0.3", "depth = 0.3\nt = 3", "constants.t: has a meaning in every expression already"),
-        ("depth = 0.3", "depth = 0.3\nlambda = 3", "constants.lambda: has a meaning in every expression already"),
-        ("depth = 0.3", "depth = true", "constants.depth: must be a number up to 1e+15, or an expression in quotes"),
-        ("depth = 0.3", "depth = nan", "constants.depth: must be a number up to 1e+15, or an expression in quotes"),
-        ("depth = 0.3", 'depth = "0.3 +"', "constants.depth: is not an expression"),
-        ("depth = 0.3", 'depth = "1 / 0"', "constants.depth: is not finite"),
-        ("depth = 0.3", "'a b' = 1\ndepth = 0.3", "constants.a b: is not a valid name in an expression"),
-        ('omega = "2', 'omega = "omega + 2', 'constants.omega: has an unknown name "omega"'),
-        ('omega = "2', 'omega = "z + 2', 'constants.omega: has no "z" in a 2D scene'),
-        ('["swirl"', '["swirl(2)"', 'forces[0].acceleration[0]: takes "swirl" for a function, which it is not'),
-        ('["swirl"', '["swirl > 1"', "forces[0].acceleration[0]: needs a number where"),
-    ],
-)
+@pytest.mark.parametrize(("right", "wrong", "said"), [
+    ('["swirl"', '["swirrl"', 'forces[0].acceleration[0]: has an unknown name "swirrl"; did you mean "swirl"?'),
+    ('"0.1 * ramp"', '"swirl"', 'domain.gravity[0]: uses "swirl", which depends on "x"; the names here are t'),
+    ("depth = 0.3", "depth = 0.3\npi = 3", "constants.pi: has a meaning in every expression already"),
+    ("depth = 0.3", "depth = 0.3\nmin = 3", "constants.min: has a meaning in every expression already"),
+    ("depth = 0.3", "depth = 0.3\nt = 3", "constants.t: has a meaning in every expression already"),
+    ("depth = 0.3", "depth = 0.3\nlambda = 3", "constants.lambda: has a meaning in every expression already"),
+    ("depth = 0.3", "depth = true", "constants.depth: must be a number up to 1e+15, or an expression in quotes"),
+    ("depth = 0.3", "depth = nan", "constants.depth: must be a number up to 1e+15, or an expression in quotes"),
+    ("depth = 0.3", 'depth = "0.3 +"', "constants.depth: is not an expression"),
+    ("depth = 0.3", 'depth = "1 / 0"', "constants.depth: is not finite"),
+    ("depth = 0.3", "'a b' = 1\ndepth = 0.3", "constants.a b: is not a valid name in an expression"),
+    ('omega = "2', 'omega = "omega + 2', 'constants.omega: has an unknown name "omega"'),
+    ('omega = "2', 'omega = "z + 2', 'constants.omega: has no "z" in a 2D scene'),
+    ('["swirl"', '["swirl(2)"', 'forces[0].acceleration[0]: takes "swirl" for a function, which it is not'),
+    ('["swirl"', '["swirl > 1"', "forces[0].acceleration[0]: needs a number where"),
+])  # fmt: skip
 def test_one_fault_has_one_sentence(right: str, wrong: str, said: str) -> None:
     assert right in SCENE
     with pytest.raises(InputError) as refused:

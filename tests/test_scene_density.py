@@ -5,9 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scenes
+from scenes import ball, box, liquid, polygon, scene_of
 
-from mpmcli.materials.registry import parameter_models
-from mpmcli.scene import parse_scene, sample_bodies
+from mpmcli.scene import sample_bodies
 from mpmcli.scene.sampling import BodyParticles
 from mpmcli.scene.shapes import Form
 
@@ -17,28 +18,21 @@ CORNERS = "".join(f"v {x} {y} {z}\n" for x, y, z in product((0, 1), repeat=3))
 FACES = ("1 2 4 3", "5 7 8 6", "1 5 6 2", "3 4 8 7", "1 3 7 5", "2 6 8 4")
 
 
-def box(lower: float, upper: float, d: int) -> dict:
-    return {"box": {"min": [lower] * d, "max": [upper] * d}}
+def cube(lower: float, upper: float, d: int) -> dict:
+    return box([lower] * d, [upper] * d)
 
 
 def shapes(d: int, size: float, at: float) -> dict[str, dict]:
     """Return shapes of about a size, m, with their lower corner at a place on the diagonal."""
     end, middle = at + size, at + 0.5 * size
-    ball = {"ball": {"center": [middle] * d, "radius": 0.5 * size}}
+    far = [at + 1.1 * size] + [at + 0.8 * size] * (d - 1)
     found = {
-        "box": box(at, end, d),
-        "box and box": box(at, end, d) | {"add": [box(at + 0.3 * size, at + 1.2 * size, d)]},
-        "box less box": box(at, end, d) | {"subtract": [box(at + 0.7 * size, at + 1.1 * size, d)]},
-        "box less ball": box(at, end, d)
-        | {"subtract": [{"ball": {"center": [at + 0.2 * size] * d, "radius": 0.17 * size}}]},
-        "ball": ball,
-        "capsule": {
-            "capsule": {
-                "start": [middle] * d,
-                "end": [at + 1.1 * size] + [at + 0.8 * size] * (d - 1),
-                "radius": 0.5 * size,
-            }
-        },
+        "box": cube(at, end, d),
+        "box and box": cube(at, end, d) | {"add": [cube(at + 0.3 * size, at + 1.2 * size, d)]},
+        "box less box": cube(at, end, d) | {"subtract": [cube(at + 0.7 * size, at + 1.1 * size, d)]},
+        "box less ball": cube(at, end, d) | {"subtract": [ball([at + 0.2 * size] * d, 0.17 * size)]},
+        "ball": ball([middle] * d, 0.5 * size),
+        "capsule": {"capsule": {"start": [middle] * d, "end": far, "radius": 0.5 * size}},
     }
     if d == 2:
         corners = {
@@ -46,7 +40,7 @@ def shapes(d: int, size: float, at: float) -> dict[str, dict]:
             "trapezoid": [[at, at], [at + 1.4 * size, at], [end, end], [at + 0.1 * size, end]],
             "angle": [[at, at], [end + size, at], [end + size, end], [end, end], [end, end + size], [at, end + size]],
         }
-        return found | {name: {"polygon": {"vertices": vertices}} for name, vertices in corners.items()}
+        return found | {name: polygon(vertices) for name, vertices in corners.items()}
     cylinder = {"base": [middle, middle, at], "axis": [0, 0, 1], "radius": 0.5 * size, "height": size}
     tilted = {"base": [at + 0.6 * size] * 3, "axis": [1, 1, 2], "radius": 0.5 * size, "height": size}
     mesh = {"file": "cube.obj", "scale": size, "translate": [at] * 3}
@@ -62,16 +56,8 @@ def shapes(d: int, size: float, at: float) -> dict[str, dict]:
 def sampled(shape: dict, d: int, directory: Path, **body: object) -> tuple[BodyParticles, Form]:
     """Return the particles of a body in a wide domain, and its form."""
     (directory / "cube.obj").write_text(CORNERS + "".join(f"f {face}\n" for face in FACES))
-    material = {"law": "fluid", "density": DENSITY, "bulk_modulus": 1e5}
-    scene = parse_scene(
-        {
-            "domain": {"size": [40 * H] * d, "spacing": H},
-            "time": {"end": 1.0, "frames": 1},
-            "bodies": [{"name": "body", "material": material, "shape": shape, **body}],
-        },
-        directory=directory,
-        laws=parameter_models(),
-    ).scene
+    own = scenes.body("body", liquid(1e5, density=DENSITY), shape, **body)
+    scene = scene_of(own, size=[40 * H] * d, spacing=H, contact={}, directory=directory)
     return sample_bodies(scene)[0], scene.bodies[0].shape.form
 
 

@@ -8,16 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import create_model
+from scenes import ball, body, box, polygon
 
 from mpmcli.materials.registry import parameter_models
-from mpmcli.scene import (
-    estimate_particles,
-    json_schema,
-    load_scene,
-    parse_scene,
-    sample_bodies,
-    scene_to_toml,
-)
+from mpmcli.scene import estimate_particles, json_schema, load_scene, parse_scene, sample_bodies, scene_to_toml
 from mpmcli.scene.expand import PRESETS
 from mpmcli.scene.quantity import Table
 from mpmcli.scene.schema import scene_model
@@ -41,12 +35,7 @@ def materials(draw):
         modulus = draw(st.one_of(st.just("auto"), st.floats(1e-3, 1e12)))
         return {"law": "fluid", "density": draw(st.floats(1e-3, 1e5)), "bulk_modulus": modulus}
     ratio = draw(st.floats(0, 0.49, allow_subnormal=False))
-    return {
-        "law": "neo_hookean",
-        "density": 1.0,
-        "youngs_modulus": draw(st.floats(1, 1e12)),
-        "poissons_ratio": ratio,
-    }
+    return {"law": "neo_hookean", "density": 1.0, "youngs_modulus": draw(st.floats(1, 1e12)), "poissons_ratio": ratio}
 
 
 @st.composite
@@ -61,9 +50,9 @@ def scenes(draw):
         return [o + share * 10 * h for o, share in zip(origin, shares, strict=False)]
 
     shapes = [
-        {"box": {"min": at(0.1, 0.2, 0.3), "max": at(0.4, 0.5, 0.6)}},
-        {"ball": {"center": at(0.5, 0.5, 0.5), "radius": 4.5 * h}},
-        {"polygon": {"vertices": [at(0.1, 0.1), at(0.9, 0.2), at(0.8, 0.9), at(0.5, 0.5)]}}
+        box(at(0.1, 0.2, 0.3), at(0.4, 0.5, 0.6)),
+        ball(at(0.5, 0.5, 0.5), 4.5 * h),
+        polygon([at(0.1, 0.1), at(0.9, 0.2), at(0.8, 0.9), at(0.5, 0.5)])
         if d == 2
         else {"cylinder": {"base": at(0.5, 0.5, 0.1), "axis": [0.1, 0, 1], "radius": h, "height": 4 * h}},
     ]
@@ -189,13 +178,7 @@ def test_long_lists_are_one_entry_a_line():
     data = {
         "domain": {"size": [1, 1], "spacing": 0.1},
         "time": {"end": 1, "frames": 1},
-        "bodies": [
-            {
-                "name": "saw",
-                "material": {"law": "fluid", "density": 1},
-                "shape": {"polygon": {"vertices": vertices}},
-            }
-        ],
+        "bodies": [body("saw", {"law": "fluid", "density": 1}, polygon(vertices))],
     }
     text = scene_to_toml(parse_scene(data, laws=LAWS).scene)
     assert max(map(len, text.splitlines())) < 110

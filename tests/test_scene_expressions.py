@@ -17,13 +17,8 @@ from mpmcli.solver.machine.backend import Backend
 
 LAWS = parameter_models()
 SCENE = """
-[domain]
-size = [1.0, 0.8]
-spacing = 0.05
-gravity = ["3 * sin(t)", -9.81]
-[time]
-end = 2.0
-frames = 4
+domain = { size = [1.0, 0.8], spacing = 0.05, gravity = ["3 * sin(t)", -9.81] }
+time = { end = 2.0, frames = 4 }
 [[bodies]]
 name = "pool"
 material = { law = "fluid", density = 1000.0, bulk_modulus = 1e5 }
@@ -106,13 +101,13 @@ def test_hydrostatic_needs_gravity_that_it_can_balance(tmp_path):
     }.items():
         with pytest.raises(InputError) as error:
             loaded(tmp_path, f"domain.gravity={gravity}", text=text)
-        assert str(error.value) == f"{tmp_path / 'scene.toml'}:14: bodies[0].initial_pressure: {said}"
+        assert str(error.value) == f"{tmp_path / 'scene.toml'}:9: bodies[0].initial_pressure: {said}"
 
 
 def test_errors_name_the_line(tmp_path):
     with pytest.raises(InputError) as error:
         loaded(tmp_path, text=SCENE.replace("-4 * (x - X)", "-4 * (q - X)"))
-    assert str(error.value).startswith(f"{tmp_path / 'scene.toml'}:23: forces[0].acceleration[0]: has an unknown name")
+    assert str(error.value).startswith(f"{tmp_path / 'scene.toml'}:18: forces[0].acceleration[0]: has an unknown name")
 
 
 def body_of(tmp_path, *overrides):

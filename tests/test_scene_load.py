@@ -143,24 +143,7 @@ def test_a_scene_without_a_file_has_no_lines():
 
 def test_whatever_is_damaged_the_answer_is_sentences_or_a_scene():
     """Deletions, misspellings and odd values anywhere: only InputError, and every line has its place."""
-    odd = [
-        0,
-        -1,
-        1e308,
-        10**400,
-        float("nan"),
-        "x",
-        "auto",
-        "",
-        True,
-        [],
-        [1],
-        [1, 2, 3],
-        {},
-        {"a": 1},
-        [[1, 2]],
-        [{}],
-    ]
+    odd = [0, -1, 1e308, 10**400, float("nan"), "x", "auto", "", True, [], [1], [1, 2, 3], {}, {"a": 1}, [[1, 2]], [{}]]
     rng = random.Random(1)
     refused = 0
     presets = GOOD + '[[bodies]]\nname = "mud"\nmaterial = "mud"\nshape.ball = { center = [2, 0.3], radius = 0.1 }\n'

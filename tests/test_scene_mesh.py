@@ -1,6 +1,5 @@
 """Meshes: against an analytic ball, a torus, a box, and files that make no closed surface."""
 
-import copy
 import math
 import re
 from pathlib import Path
@@ -10,6 +9,7 @@ import pytest
 import pyvista as pv
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scenes import body, liquid, tables_of
 
 from mpmcli.check.geometry import distance_between, thickness
 from mpmcli.dataset.draw import draw
@@ -45,12 +45,9 @@ def mesh(path: str, **keys: object) -> Mesh:
 
 def loaded(shape: dict, directory: Path, size: tuple[float, ...] = (1.0, 1.0, 1.0)) -> LoadedScene:
     """Return a scene of water in a shape, with its notes."""
-    data = {
-        "domain": {"size": list(size), "spacing": 0.05},
-        "time": {"end": 1.0, "frames": 1},
-        "bodies": [{"name": "b", "material": {"law": "fluid", "density": 800.0, "bulk_modulus": 1e5}, "shape": shape}],
-    }
-    return parse_scene(copy.deepcopy(data), laws=parameter_models(), directory=directory)
+    own = body("b", liquid(1e5, density=800.0), shape)
+    data = tables_of(own, size=list(size), spacing=0.05, contact={})
+    return parse_scene(data, laws=parameter_models(), directory=directory)
 
 
 def scene_of(shape: dict, size: tuple[float, ...] = (1.0, 1.0, 1.0), directory: Path = Path()) -> Scene:
@@ -332,21 +329,15 @@ def wound_twice(n: int = 11) -> pv.PolyData:
 
 
 BAD = {
-    "open": (
-        lambda: pv.Box().triangulate().extract_cells(range(10)).extract_surface(algorithm=None),
-        "its surface is open: 4 of 17",
-    ),
-    "turned": (
-        lambda: pv.PolyData(BOX.points, np.concatenate([BOX.faces[:4][[0, 2, 1, 3]], BOX.faces[4:]])),
-        "its triangles face different sides across 3 of 18 edges",
-    ),
+    "open": (lambda: pv.Box().triangulate().extract_cells(range(10)).extract_surface(algorithm=None),
+         "its surface is open: 4 of 17"),
+    "turned": (lambda: pv.PolyData(BOX.points, np.concatenate([BOX.faces[:4][[0, 2, 1, 3]], BOX.faces[4:]])),
+         "its triangles face different sides across 3 of 18 edges"),
     "overlap": (lambda: wound_twice(), "its surface overlaps itself, for example at ["),
-    "inside out": (
-        lambda: pv.merge([cube((0, 0, 0)), cube((2, 0.1, 0.1), 0.02, -1)], merge_points=False),
-        "a part of its surface is inside out, at [2.01, 0.11, 0.11] in its own units",
-    ),
+    "inside out": (lambda: pv.merge([cube((0, 0, 0)), cube((2, 0.1, 0.1), 0.02, -1)], merge_points=False),
+         "a part of its surface is inside out, at [2.01, 0.11, 0.11] in its own units"),
     "points": (lambda: pv.PolyData(np.eye(3)), "it holds no triangle"),
-}
+}  # fmt: skip
 BOX = pv.Box().triangulate()
 
 
@@ -361,17 +352,10 @@ def test_a_file_that_makes_no_closed_surface_is_named(tmp_path: Path, name: str)
         scene_of({"mesh": {"file": path}})
 
 
-@pytest.mark.parametrize(
-    ("name", "content"),
-    [
-        ("m.stl", b"hello"),
-        ("m.obj", b"v 1 2 x\n"),
-        ("m.ply", b"ply\n"),
-        ("m.vtu", b"<VTK"),
-        ("m.csv", b"1,2,3"),
-        ("m.stl", b""),
-    ],
-)
+@pytest.mark.parametrize(("name", "content"), [
+    ("m.stl", b"hello"), ("m.obj", b"v 1 2 x\n"), ("m.ply", b"ply\n"), ("m.vtu", b"<VTK"), ("m.csv", b"1,2,3"),
+    ("m.stl", b""),
+])  # fmt: skip
 def test_a_damaged_file_is_one_sentence_and_nothing_else(
     tmp_path: Path, capfd: pytest.CaptureFixture, name: str, content: bytes
 ) -> None:
@@ -440,9 +424,9 @@ def test_a_sweep_varies_a_mesh_beside_its_base_scene(tmp_path: Path) -> None:
     sweep = load_sweep(tmp_path / "sweep.toml", laws=parameter_models())
     bodies = [draw(sweep, number).scene(parameter_models()).scene.bodies[0] for number in range(2)]
     assert bodies[0].seed != bodies[1].seed
-    for body in bodies:
-        scale = body.shape.mesh.scale
-        assert body.shape.form.volume == pytest.approx(
+    for one in bodies:
+        scale = one.shape.mesh.scale
+        assert one.shape.form.volume == pytest.approx(
             scale**3 * mesh(str(tmp_path / "scenes/ball.stl")).volume, rel=1e-6
         )
     (tmp_path / "sweep.toml").write_text(lines.replace("1.1", "2.0"), encoding="utf-8")

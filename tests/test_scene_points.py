@@ -1,15 +1,16 @@
 """Bodies from point files: positions and velocities as they stand there, volumes as asked, faults in one sentence."""
 
-import copy
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import pyvista as pv
+import scenes
 from command import run_here
 from drawn_results import JELLY, WATER, frame, header
 from drawn_results import write as write_result
+from scenes import liquid, tables_of
 
 from mpmcli.errors import InputError
 from mpmcli.materials.registry import parameter_models
@@ -45,24 +46,13 @@ def write(path: Path, d: int) -> dict[str, Any]:
 
 def scene_data(table: dict[str, Any], d: int = 2, **body: Any) -> dict[str, Any]:
     """Return the tables of a scene of water in points."""
-    return {
-        "domain": {"size": [1.0] * d, "spacing": 0.1},
-        "time": {"end": 1.0, "frames": 1},
-        "bodies": [
-            {
-                "name": "b",
-                "material": {"law": "fluid", "density": 800.0, "bulk_modulus": 1e5},
-                "shape": {"points": table},
-                **body,
-            }
-        ],
-    }
+    own = scenes.body("b", liquid(1e5, density=800.0), {"points": table}, **body)
+    return tables_of(own, size=[1.0] * d, spacing=0.1, contact={})
 
 
 def scene_of(directory: Path, table: dict[str, Any], d: int = 2, **body: Any) -> Scene:
     """Return that scene."""
-    data = copy.deepcopy(scene_data(table, d, **body))
-    return parse_scene(data, laws=parameter_models(), directory=directory).scene
+    return parse_scene(scene_data(table, d, **body), laws=parameter_models(), directory=directory).scene
 
 
 @pytest.mark.parametrize("d", [2, 3])
@@ -211,7 +201,7 @@ def test_one_of_several_times_is_read_and_said(result: Path, keys: dict, k: int)
     """By default the last, and only particles that are there, with their velocity, C, and J from the density."""
     table = {"file": "run/particles.vtkhdf", "spacing": 0.05, "velocity": "velocity", "body": "body 0", **keys}
     rows = [0, 2, 3] if k else [0, 1, 2, 3]
-    data = {"law": "fluid", "density": 1000.0, "bulk_modulus": 1e5}
+    data = liquid(1e5)
     scene = scene_of(result, table, material=data)
     (found,) = sample_bodies(scene)
     assert found.position == pytest.approx(POINTS[2][rows] * (1 - 0.1 * k), abs=1e-6)
@@ -271,18 +261,10 @@ def test_a_file_of_one_time_has_no_frames(tmp_path: Path) -> None:
 
 
 GOES_ON = """\
-[domain]
-size = [1.4, 0.7]
-spacing = 0.05
-gravity = [0.0, -9.81]
-[time]
-end = {end}
-frames = {frames}
-step = 2e-4
-[solver]
-precision = "f64"
-[output]
-fields = ["velocity", "affine", "deformation_gradient", "initial_position", "plastic_volume_ratio"]
+domain = {{ size = [1.4, 0.7], spacing = 0.05, gravity = [0.0, -9.81] }}
+time = {{ end = {end}, frames = {frames}, step = 2e-4 }}
+solver = {{ precision = "f64" }}
+output = {{ fields = ["velocity", "affine", "deformation_gradient", "initial_position", "plastic_volume_ratio"] }}
 [[bodies]]
 name = "jelly"
 material = {{ law = "neo_hookean", density = 1000.0, youngs_modulus = 2e4, poissons_ratio = 0.3 }}

@@ -5,10 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scenes
 from good_scene import GOOD, refusal
+from scenes import body, liquid
 
-from mpmcli.materials.registry import parameter_models
-from mpmcli.scene import Scene, parse_scene, sample_bodies, scene_to_toml
+from mpmcli.scene import Scene, sample_bodies, scene_to_toml
 from mpmcli.scene.primitives import Solid
 from mpmcli.scene.primitives import rotation as rotation_about
 from mpmcli.scene.surface import form_surface
@@ -41,13 +42,8 @@ SHAPES = {
 def scene_of(shape: dict, d: int, directory: Path) -> Scene:
     """Return a scene with a body of this shape, and a collider of the same elsewhere."""
     (directory / "tetrahedron.obj").write_text(TETRAHEDRON)
-    material = {"law": "fluid", "density": 1000.0, "bulk_modulus": 1e5}
-    data = {
-        "domain": {"size": [2.0] * d, "origin": [-0.5] * d, "spacing": 0.05},
-        "time": {"end": 1.0, "frames": 1},
-        "bodies": [{"name": "body", "material": material, "shape": shape}],
-    }
-    return parse_scene(data, laws=parameter_models(), directory=directory).scene
+    own = body("body", liquid(1e5), shape)
+    return scenes.scene_of(own, size=[2.0] * d, origin=[-0.5] * d, spacing=0.05, contact={}, directory=directory)
 
 
 def turn_of(rotated: object) -> np.ndarray:

@@ -1,32 +1,27 @@
 """Particles of bodies: how many, where, and with exactly the mass of the shape."""
 
-import copy
-
 import numpy as np
 import pytest
+import scenes
 from hypothesis import given
 from hypothesis import strategies as st
+from scenes import ball, box, polygon
 from scipy.spatial import KDTree
 
 from mpmcli.errors import InputError
-from mpmcli.materials.registry import parameter_models
-from mpmcli.scene import estimate_particles, parse_scene, sample_bodies, sampling
+from mpmcli.scene import estimate_particles, sample_bodies, sampling
 from mpmcli.scene.sampling import disk_radius
 
 FLUID = {"law": "fluid", "density": 800.0, "bulk_modulus": 1e5}
 
 
 def scene_of(*bodies, size=(4.0, 4.0), spacing=0.1, **domain):
-    data = {
-        "domain": {"size": list(size), "spacing": spacing, **domain},
-        "time": {"end": 1.0, "frames": 1},
-        "bodies": [{"name": f"b{i}", "material": FLUID, **body} for i, body in enumerate(bodies)],
-    }
-    return parse_scene(copy.deepcopy(data), laws=parameter_models()).scene
+    named = [{"name": f"b{i}", "material": FLUID, **body} for i, body in enumerate(bodies)]
+    return scenes.scene_of(*named, size=list(size), spacing=spacing, contact={}, **domain)
 
 
-BOX = {"box": {"min": [0.0, 0.0], "max": [1.0, 0.5]}}
-DISC = {"ball": {"center": [2.5, 2.5], "radius": 1.0}}
+BOX = box([0.0, 0.0], [1.0, 0.5])
+DISC = ball([2.5, 2.5], 1.0)
 
 
 def test_a_box_on_the_grid_has_particles_at_a_quarter_and_three_quarters_of_each_cell():
@@ -59,10 +54,7 @@ def test_in_3d_27_particles_per_cell():
 )
 def test_a_box_of_any_size_is_filled_evenly(lower, extent, jittered):
     upper = [lo + e for lo, e in zip(lower, extent, strict=True)]
-    body = {
-        "shape": {"box": {"min": list(lower), "max": upper}},
-        "sampling": "jittered" if jittered else "lattice",
-    }
+    body = {"shape": box(lower, upper), "sampling": "jittered" if jittered else "lattice"}
     scene = scene_of(body)
     (particles,) = sample_bodies(scene)
     assert particles.count == estimate_particles(scene)
@@ -76,12 +68,9 @@ def test_a_box_of_any_size_is_filled_evenly(lower, extent, jittered):
 
 SHAPES = {
     "disc": ((4, 4), DISC),
-    "polygon": ((4, 4), {"polygon": {"vertices": [[0.5, 0.5], [3, 1], [2, 3]]}}),
-    "ball": ((2, 2, 2), {"ball": {"center": [1, 1, 1], "radius": 0.7}}),
-    "cylinder": (
-        (2, 2, 2),
-        {"cylinder": {"base": [0.5, 0.5, 0.5], "axis": [1, 1, 1], "radius": 0.4, "height": 1}},
-    ),
+    "polygon": ((4, 4), polygon([[0.5, 0.5], [3, 1], [2, 3]])),
+    "ball": ((2, 2, 2), ball([1, 1, 1], 0.7)),
+    "cylinder": ((2, 2, 2), {"cylinder": {"base": [0.5, 0.5, 0.5], "axis": [1, 1, 1], "radius": 0.4, "height": 1}}),
 }
 
 
@@ -110,13 +99,7 @@ def test_a_disc_on_a_lattice_is_symmetric():
 
 @pytest.mark.parametrize("count", [3, 5, 7])
 def test_jittered_takes_any_number_per_cell(count):
-    scene = scene_of(
-        {
-            "shape": {"box": {"min": [0, 0], "max": [3.0, 3.0]}},
-            "sampling": "jittered",
-            "particles_per_cell": count,
-        }
-    )
+    scene = scene_of({"shape": box([0, 0], [3.0, 3.0]), "sampling": "jittered", "particles_per_cell": count})
     (particles,) = sample_bodies(scene)
     assert particles.count == pytest.approx(900 * count, rel=0.02)
     assert np.unique(particles.position, axis=0).shape == particles.position.shape
@@ -129,7 +112,7 @@ def test_jitter_is_told_by_the_seed_and_the_body_alone(monkeypatch):
 
     first = positions(7)
     assert np.array_equal(first, positions(7))
-    assert np.array_equal(first, positions(7, other={"box": {"min": [0, 0], "max": [0.3, 0.3]}}))
+    assert np.array_equal(first, positions(7, other=box([0, 0], [0.3, 0.3])))
     assert not np.array_equal(first, positions(8))
     monkeypatch.setattr(sampling, "_POINTS_AT_ONCE", 37)
     assert np.array_equal(first, positions(7))
@@ -164,7 +147,7 @@ def test_an_enormous_scene_is_estimated_without_being_made():
 
 def test_a_body_too_thin_for_its_lattice_is_named(monkeypatch):
     monkeypatch.setattr("mpmcli.scene.checks._MOST_SEARCHED", 0)
-    sliver = {"polygon": {"vertices": [[0, 1], [1, 1.1], [0, 1.00001]]}}
+    sliver = polygon([[0, 1], [1, 1.1], [0, 1.00001]])
     scene = scene_of({"shape": sliver})
     with pytest.raises(InputError, match='body "b0" is too thin to hold a particle'):
         sample_bodies(scene)
@@ -204,9 +187,9 @@ def test_a_poisson_disk_sample_is_told_by_the_seed_and_the_body_alone():
 
     first = positions(7)
     assert np.array_equal(first, positions(7))
-    assert np.array_equal(first, positions(7, other={"box": {"min": [0, 0], "max": [0.3, 0.3]}}))
+    assert np.array_equal(first, positions(7, other=box([0, 0], [0.3, 0.3])))
     assert first.shape != positions(8).shape or not np.array_equal(first, positions(8))
-    boxes = [{"shape": {"box": {"min": [x, 0], "max": [x + 1, 1]}}, "sampling": "poisson"} for x in (0, 2)]
+    boxes = [{"shape": box([x, 0], [x + 1, 1]), "sampling": "poisson"} for x in (0, 2)]
     a, b = sample_bodies(scene_of(*boxes))
     assert a.position.shape != b.position.shape or not np.allclose(a.position + np.array([2, 0]), b.position)
 

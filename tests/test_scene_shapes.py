@@ -180,17 +180,14 @@ def test_distances_and_crossings_are_those_of_all_edges(seed, n):
         assert not cross
 
 
-@pytest.mark.parametrize(
-    ("vertices", "sentence"),
-    [
-        ([(0, 0), (1, 1), (1, 0), (0, 1)], "the edges after vertices 0 and 2 cross or touch"),
-        ([(0, 0), (2, 0), (2, 2), (1, 0), (0, 2)], "the edges after vertices 0 and 2 cross or touch"),
-        ([(0, 0), (1, 0), (1, 0), (0, 1)], "vertex 2 repeats the one before it"),
-        ([(0, 0), (1, 0), (1, 1), (0, 0)], "the last vertex repeats the first"),
-        ([(0, 0), (2, 0), (1, 0), (1, 1)], "the outline runs back on itself at vertex 1"),
-        ([(0, 0), (1, 0), (2, 0)], "the outline runs back on itself"),
-    ],
-)
+@pytest.mark.parametrize(("vertices", "sentence"), [
+    ([(0, 0), (1, 1), (1, 0), (0, 1)], "the edges after vertices 0 and 2 cross or touch"),
+    ([(0, 0), (2, 0), (2, 2), (1, 0), (0, 2)], "the edges after vertices 0 and 2 cross or touch"),
+    ([(0, 0), (1, 0), (1, 0), (0, 1)], "vertex 2 repeats the one before it"),
+    ([(0, 0), (1, 0), (1, 1), (0, 0)], "the last vertex repeats the first"),
+    ([(0, 0), (2, 0), (1, 0), (1, 1)], "the outline runs back on itself at vertex 1"),
+    ([(0, 0), (1, 0), (2, 0)], "the outline runs back on itself"),
+])  # fmt: skip
 def test_a_polygon_must_be_simple(vertices, sentence):
     with pytest.raises(ValidationError, match=sentence):
         make(Polygon, 2, vertices=vertices)

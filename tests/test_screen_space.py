@@ -4,14 +4,7 @@ import numpy as np
 import pytest
 
 from mpmcli.render.dots import hidden
-from mpmcli.render.liquid_surface import (
-    NOTHING,
-    blurred,
-    normals,
-    smoothed,
-    sphere_depths,
-    thickness,
-)
+from mpmcli.render.liquid_surface import NOTHING, blurred, normals, smoothed, sphere_depths, thickness
 from mpmcli.render.particle_grid import deposited
 
 SHAPE = (60, 80)

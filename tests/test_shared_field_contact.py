@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from solver_state import scene_of
+from scenes import block, scene_of, slow
 
 from mpmcli.check.result_check import ENERGY_SUSPECT, energy_change
 from mpmcli.scene import Scene
@@ -18,16 +18,14 @@ JELLY = {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 1e6, "poisso
 
 def body(name: str, material: dict, low: list[float], high: list[float], **more: object) -> dict:
     """Return a box; coordinates in cells."""
-    shape = {"box": {"min": [H * x for x in low], "max": [H * x for x in high]}}
-    return {"name": name, "material": material, "shape": shape} | more
+    return block(name, material, [H * x for x in low], [H * x for x in high]) | more
 
 
 def scene(bodies: list[dict], end: float, walls: object = "separate", **tables: object) -> Scene:
     """Return bodies in a domain of 48 x 32 cells, if no other size is given."""
     domain = {"size": [48 * H, 32 * H], "spacing": H, "gravity": [0.0, -G], "walls": walls}
-    tables = {"contact": {"default": "separate"}} | tables
-    times = {"end": end, "frames": 40} | tables.pop("time", {})
-    return scene_of(domain=domain | tables.pop("domain", {}), time=times, bodies=bodies, **tables)
+    usual = {"end": end, "frames": 40, "contact": {"default": "separate"}}
+    return scene_of(*bodies, domain=domain | tables.pop("domain", {}), **usual | tables)
 
 
 def energies(rows: list) -> np.ndarray:
@@ -35,16 +33,13 @@ def energies(rows: list) -> np.ndarray:
     return np.array([(row.kinetic + row.potential + row.elastic) / (row.mass * G * H) for row in rows])
 
 
-@pytest.mark.parametrize(
-    ("material", "offset", "sampling", "safety"),
-    [
-        pytest.param(WATER, 0.0, "lattice", 0.8, marks=pytest.mark.slow),
-        (WATER, 0.4, "lattice", 0.8),
-        (SAND, 0.3, "lattice", 0.8),
-        pytest.param(WATER, 0.3, "jittered", 0.8, marks=pytest.mark.slow),
-        pytest.param(WATER, 0.4, "lattice", 0.4, marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.parametrize(("material", "offset", "sampling", "safety"), [
+    slow(WATER, 0.0, "lattice", 0.8),
+    (WATER, 0.4, "lattice", 0.8),
+    (SAND, 0.3, "lattice", 0.8),
+    slow(WATER, 0.3, "jittered", 0.8),
+    slow(WATER, 0.4, "lattice", 0.4),
+])  # fmt: skip
 def test_what_falls_on_jelly_lies_on_its_surface(
     backend_of: Callable, material: dict, offset: float, sampling: str, safety: float, record_property: Callable
 ) -> None:
@@ -76,19 +71,16 @@ def test_a_jet_does_not_crush_the_surface_of_soft_jelly(backend_of: Callable) ->
     assert min(1000 / frame.fields["density"][frame.body == 0].max() for frame, _ in frames) > 0.42
 
 
-@pytest.mark.parametrize(
-    ("fall", "shift", "sampling", "safety", "off"),
-    [
-        # 0.134 cells too deep.
-        (0.0, 0.0, "lattice", 0.8, 0.15),
-        # 0.129 cells too deep.
-        pytest.param(2.0, 0.0, "lattice", 0.8, 0.15, marks=pytest.mark.slow),
-        pytest.param(0.0, 0.3, "lattice", 0.8, 0.12, marks=pytest.mark.slow),
-        # 0.186 cells.
-        pytest.param(0.0, 0.0, "jittered", 0.8, 0.22, marks=pytest.mark.slow),
-        pytest.param(0.0, 0.0, "lattice", 0.4, 0.12, marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.parametrize(("fall", "shift", "sampling", "safety", "off"), [
+    # 0.134 cells too deep.
+    (0.0, 0.0, "lattice", 0.8, 0.15),
+    # 0.129 cells too deep.
+    slow(2.0, 0.0, "lattice", 0.8, 0.15),
+    slow(0.0, 0.3, "lattice", 0.8, 0.12),
+    # 0.186 cells.
+    slow(0.0, 0.0, "jittered", 0.8, 0.22),
+    slow(0.0, 0.0, "lattice", 0.4, 0.12),
+])  # fmt: skip
 def test_a_block_of_jelly_floats_at_its_depth(
     backend_of: Callable, fall: float, shift: float, sampling: str, safety: float, off: float, record_property: Callable
 ) -> None:
@@ -155,12 +147,7 @@ def test_a_ball_of_jelly_sinks(backend_of: Callable, record_property: Callable) 
 
 
 @pytest.mark.parametrize(
-    ("material", "friction", "offset"),
-    [
-        (SAND, 0.2, 0.3),
-        pytest.param(SAND, 0.0, 0.0, marks=pytest.mark.slow),
-        pytest.param(WATER, 0.0, 0.3, marks=pytest.mark.slow),
-    ],
+    ("material", "friction", "offset"), [(SAND, 0.2, 0.3), slow(SAND, 0.0, 0.0), slow(WATER, 0.0, 0.3)]
 )
 def test_layers_slide_down_jelly(backend_of: Callable, material: dict, friction: float, offset: float) -> None:
     """With g (sin - mu cos) down a slope of 20 degrees."""

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import single_precision_run
 from rounding import farthest
+from scenes import slow
 from single_precision_run import in_single_precision
 from test_batch import batch_of, outputs_of, scene_named
 
@@ -19,10 +20,7 @@ from mpmcli.solver.engine.run import build_run
 ROOT = Path(__file__).resolve().parent.parent
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["gravity of time", *(pytest.param(n, marks=pytest.mark.slow) for n in ("sand", "forces on one body of two"))],
-)
+@pytest.mark.parametrize("name", ["gravity of time", *(slow(n) for n in ("sand", "forces on one body of two"))])
 def test_runs_follow_those_with_double_precision(backend_of: Callable, name: str) -> None:
     """Two runs in which all numbers differ: as many steps, and what sums in another order changes by round-off."""
     scenes = [scene_named(name), scene_named(name, other=True)]
@@ -42,7 +40,7 @@ def test_runs_follow_those_with_double_precision(backend_of: Callable, name: str
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("name", ["rough walls", pytest.param("forces on one body of two", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", ["rough walls", slow("forces on one body of two")])
 def test_no_kernel_counts_in_double_precision(name: str) -> None:
     """Not one number of 64 bits in the intermediate code of all kernels, which is not empty."""
     path = os.pathsep.join([str(ROOT), str(ROOT / "tests"), os.environ.get("PYTHONPATH", "")])

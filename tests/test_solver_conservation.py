@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import restart
-from solver_state import BodyState, bodies_of, scene_of
+from scenes import ball, block, body, liquid, restart, scene_of, slow, solid
+from solver_state import BodyState, bodies_of
 
 from mpmcli.scene import BodyParticles, Scene, sample_bodies
 from mpmcli.solver.engine.run import Run, build_run
@@ -16,7 +16,7 @@ STEPS = 10_000
 SECONDS = 5.0
 H = 0.1
 EPSILON = {"f32": 2.0**-24, "f64": 2.0**-53}
-PRECISIONS = ["f64", pytest.param("f32", marks=pytest.mark.slow)]
+PRECISIONS = ["f64", slow("f32")]
 
 
 def free_scene(dimension: int, precision: str, gravity: list[float] | None = None) -> Scene:
@@ -30,38 +30,16 @@ def free_scene(dimension: int, precision: str, gravity: list[float] | None = Non
             spin[i, j] = 1.5 - 0.5 * j
             spin[j, i] = -spin[i, j]
     middle = [size / 2] * (d - 1)
+    low, high = ([0.7 - 0.4 + side, *(m - 0.4 + side for m in middle)] for side in (-half, half))
+    # Suction holds the drop together for the ten thousand steps.
+    drop, at = liquid(1e4, density=900.0, tension_cutoff=False), [size - 0.4 - 0.7, *(m - 0.4 for m in middle)]
+    motion = {"velocity": [-0.003, 0.004, 0.001][:d], "velocity_gradient": (-0.25 * spin).tolist()}
     return scene_of(
-        domain={
-            "size": [size] * d,
-            "spacing": H,
-            "origin": [-0.4] * d,
-            **({"gravity": gravity} if gravity else {}),
-        },
-        time={"end": 1.0, "frames": 1},
+        block("block", solid(1e4), low, high, velocity=[0.004, -0.003, 0.002][:d], velocity_gradient=spin.tolist()),
+        body("drop", drop, ball(at, 1.2 * half), **motion),
+        domain={"size": [size] * d, "spacing": H, "origin": [-0.4] * d, **({"gravity": gravity} if gravity else {})},
         # A shift changes momenta, by what is of second order in its way (test_redistribution.py).
         solver={"precision": precision, "redistribute": False},
-        bodies=[
-            {
-                "name": "block",
-                "material": {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 1e4},
-                "shape": {
-                    "box": {
-                        "min": [0.7 - 0.4 - half, *(m - 0.4 - half for m in middle)],
-                        "max": [0.7 - 0.4 + half, *(m - 0.4 + half for m in middle)],
-                    }
-                },
-                "velocity": [0.004, -0.003, 0.002][:d],
-                "velocity_gradient": spin.tolist(),
-            },
-            {
-                "name": "drop",
-                # Suction holds the drop together for the ten thousand steps.
-                "material": {"law": "fluid", "density": 900.0, "bulk_modulus": 1e4, "tension_cutoff": False},
-                "shape": {"ball": {"center": [size - 0.4 - 0.7, *(m - 0.4 for m in middle)], "radius": 1.2 * half}},
-                "velocity": [-0.003, 0.004, 0.001][:d],
-                "velocity_gradient": (-0.25 * spin).tolist(),
-            },
-        ],
     )
 
 
@@ -109,21 +87,20 @@ def test_free_fall(backend_of: Callable, precision: str) -> None:
     g = np.array(gravity)
     # Each step rounds x, v and the sums behind them; round-off adds up over n steps.
     tolerance = 4 * n * EPSILON[precision]
-    for name, body in bodies_of(run).items():
+    for name, state in bodies_of(run).items():
         start = before[name]
         fallen = start.x + start.v * n * dt + g * (n * dt) ** 2 / 2
         speed = np.abs(g).max() * n * dt
-        assert np.abs(body.x - fallen).max() < tolerance * np.abs(fallen).max()
-        assert np.abs(body.v - (start.v + g * (n - 0.5) * dt)).max() < tolerance * speed
+        assert np.abs(state.x - fallen).max() < tolerance * np.abs(fallen).max()
+        assert np.abs(state.v - (start.v + g * (n - 0.5) * dt)).max() < tolerance * speed
         gained = start.momentum() + start.mass.sum() * g * (n - 0.5) * dt
-        assert np.abs(body.momentum() - gained).max() < tolerance * start.mass.sum() * speed
-        rest = np.eye(2) if body.deformation.ndim == 3 else 1.0
-        assert np.abs(body.deformation - rest).max() < tolerance
+        assert np.abs(state.momentum() - gained).max() < tolerance * start.mass.sum() * speed
+        rest = np.eye(2) if state.deformation.ndim == 3 else 1.0
+        assert np.abs(state.deformation - rest).max() < tolerance
 
 
 @pytest.mark.parametrize(
-    ("precision", "dimension"),
-    [("f64", 2), *(pytest.param(*case, marks=pytest.mark.slow) for case in (("f64", 3), ("f32", 2), ("f32", 3)))],
+    ("precision", "dimension"), [("f64", 2), *(slow(*case) for case in (("f64", 3), ("f32", 2), ("f32", 3)))]
 )
 def test_momenta_over_ten_thousand_steps(
     spinning: Callable, precision: str, dimension: int, record_property: Callable
@@ -164,15 +141,15 @@ def test_rigid_translation(spinning: Callable, precision: str) -> None:
     # x changes by dt v in numbers as large as the domain: half a unit in the last place per step (9.7).
     size = max(scene.domain.size)
     tolerance = 4 * n * EPSILON[precision]
-    for name, body in bodies_of(run).items():
-        assert np.abs(body.x - before[name].x - velocity * n * dt).max() < n * EPSILON[precision] * size * 2
-        rest = np.eye(2) if body.deformation.ndim == 3 else 1.0
-        assert np.abs(body.deformation - rest).max() < max(tolerance, 1e-13)
-        energy, start = body.kinetic_energy(H), before[name].kinetic_energy(H)
+    for name, state in bodies_of(run).items():
+        assert np.abs(state.x - before[name].x - velocity * n * dt).max() < n * EPSILON[precision] * size * 2
+        rest = np.eye(2) if state.deformation.ndim == 3 else 1.0
+        assert np.abs(state.deformation - rest).max() < max(tolerance, 1e-13)
+        energy, start = state.kinetic_energy(H), before[name].kinetic_energy(H)
         assert abs(energy - start) < tolerance * start
 
 
-@pytest.mark.parametrize("dimension", [2, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("dimension", [2, slow(3)])
 def test_affine_fields_are_transferred_exactly(spinning: Callable, dimension: int) -> None:
     """v = v0 + L (x - c) with C = L, without stress: one step changes neither v nor C, for any L (Jiang 2015).
 
@@ -186,19 +163,17 @@ def test_affine_fields_are_transferred_exactly(spinning: Callable, dimension: in
         offset = sample.position - sample.position.mean(0)
         bodies.append(
             replace(
-                sample,
-                velocity=random.normal(0, 1, dimension) + offset @ L.T,
-                affine=np.tile(L, (sample.count, 1, 1)),
+                sample, velocity=random.normal(0, 1, dimension) + offset @ L.T, affine=np.tile(L, (sample.count, 1, 1))
             )
         )
     run = spinning("f64", dimension, bodies)
     before = bodies_of(run)
     dt = 0.01
     run.step(dt)
-    for name, body in bodies_of(run).items():
-        assert np.abs(body.v - before[name].v).max() < 1e-13
-        assert np.abs(body.C - L).max() < 1e-12
-        if body.deformation.ndim == 3:
-            assert np.abs(body.deformation - (np.eye(dimension) + dt * L)).max() < 1e-13
+    for name, state in bodies_of(run).items():
+        assert np.abs(state.v - before[name].v).max() < 1e-13
+        assert np.abs(state.C - L).max() < 1e-12
+        if state.deformation.ndim == 3:
+            assert np.abs(state.deformation - (np.eye(dimension) + dt * L)).max() < 1e-13
         else:
-            assert np.abs(body.deformation - np.linalg.det(np.eye(dimension) + dt * L)).max() < 1e-13
+            assert np.abs(state.deformation - np.linalg.det(np.eye(dimension) + dt * L)).max() < 1e-13

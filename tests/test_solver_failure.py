@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from solver_state import scene_of
+from scenes import block, body, liquid, scene_of, solid
 
 from mpmcli.scene import Scene, sample_bodies
 from mpmcli.solver.engine.run import Run, build_run
@@ -23,21 +23,14 @@ def scene(dimension: int = 2, precision: str = "f32") -> Scene:
     def box(low: float) -> dict:
         return {"box": {"min": [low] + [0.5] * (d - 1), "max": [low + 0.3] + [0.8] * (d - 1)}}
 
-    fluid = {"law": "fluid", "density": 1000.0, "bulk_modulus": 1e4}
+    fluid = liquid(1e4)
     return scene_of(
+        body("drop", fluid, box(-0.8), velocity=[0.1] * d),
+        body("jelly", solid(1e4), box(0.0), velocity=[0.2] * d),
+        body("second drop", {**fluid, "density": 700.0}, box(0.8)),
         domain={"size": [2.4] + [1.5] * (d - 1), "origin": [-1.0] + [0.0] * (d - 1), "spacing": H},
         time={"end": 0.2, "frames": 10},
-        solver={"precision": precision},
-        bodies=[
-            {"name": "drop", "material": fluid, "shape": box(-0.8), "velocity": [0.1] * d},
-            {
-                "name": "jelly",
-                "material": {"law": "neo_hookean", "density": 1000.0, "youngs_modulus": 1e4},
-                "shape": box(0.0),
-                "velocity": [0.2] * d,
-            },
-            {"name": "second drop", "material": {**fluid, "density": 700.0}, "shape": box(0.8)},
-        ],
+        precision=precision,
     )
 
 
@@ -54,18 +47,11 @@ def first_id(run: Run, body: str) -> int:
     return sum(counts[: names.index(body)])
 
 
-def poison_velocity(run: Run, law: str, row: int, value: float) -> None:
+def poison(run: Run, law: str, row: int, field: str, value: object) -> None:
     group, place = by_id(run, law)
-    v = group.read()["v"]
-    v[place[row]] = value
-    group.replace(v=v)
-
-
-def poison_deformation(run: Run, law: str, row: int, value: object) -> None:
-    group, place = by_id(run, law)
-    deformation = group.read()["deformation"]
-    deformation[place[row]] = value
-    group.replace(deformation=deformation)
+    values = group.read()[field]
+    values[place[row]] = value
+    group.replace(**{field: values})
 
 
 def run_until_lost(run: Run, steps: int = 40) -> UnstableRunError:
@@ -107,24 +93,20 @@ def running(started: tuple[Run, SavedState, SavedState]) -> Run:
     return run
 
 
-@pytest.mark.parametrize(
-    ("law", "body", "value", "cause"),
-    [
-        ("fluid", "drop", np.nan, "not finite"),
-        ("fluid", "second drop", -0.5, "was inverted"),
-        ("fluid", "drop", 0.0, "was inverted"),
-        ("neo_hookean", "jelly", np.nan, "not finite"),
-        ("neo_hookean", "jelly", np.diag([-1.0, 1.0]), "was inverted"),
-    ],
-    ids=["J NaN", "J negative", "J zero", "F NaN", "F inverted"],
-)
+@pytest.mark.parametrize(("law", "body", "value", "cause"), [
+    ("fluid", "drop", np.nan, "not finite"),
+    ("fluid", "second drop", -0.5, "was inverted"),
+    ("fluid", "drop", 0.0, "was inverted"),
+    ("neo_hookean", "jelly", np.nan, "not finite"),
+    ("neo_hookean", "jelly", np.diag([-1.0, 1.0]), "was inverted"),
+], ids=["J NaN", "J negative", "J zero", "F NaN", "F inverted"])  # fmt: skip
 def test_a_lost_deformation_names_its_particle(running: Run, law: str, body: str, value: object, cause: str) -> None:
     """The very particle is named, before its stress spreads over its neighbours, one step later at most."""
     names = [b.name for b in running.scene.bodies if b.material.law == law]
     counts = {s.name: s.count for s in sample_bodies(running.scene)}
     row = sum(counts[n] for n in names[: names.index(body)]) + 5
     before = running.step_count
-    poison_deformation(running, law, row, value)
+    poison(running, law, row, "deformation", value)
     error = run_until_lost(running)
     diagnosis = error.diagnosis
     assert diagnosis.particle == first_id(running, body) + 5
@@ -146,7 +128,7 @@ def test_a_lost_deformation_names_its_particle(running: Run, law: str, body: str
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e30], ids=["NaN", "infinite", "1e30"])
 def test_a_lost_velocity_names_its_body(running: Run, value: float) -> None:
     """What a velocity does reaches its neighbours in the same step: one of them is named, of the same body."""
-    poison_velocity(running, "neo_hookean", 7, value)
+    poison(running, "neo_hookean", 7, "v", value)
     before = running.step_count
     diagnosis = run_until_lost(running).diagnosis
     assert diagnosis.body == "jelly"
@@ -158,17 +140,8 @@ def test_a_lost_velocity_names_its_body(running: Run, value: float) -> None:
 def test_a_particle_that_leaves_is_named_with_its_speed(backend: Backend) -> None:
     """One lone particle, faster than the step allows, leaves: it is it, there, and that fast."""
     lone = scene_of(
+        block("bullet", liquid(1e4), [1.0, 0.7], [1.1, 0.8], particles_per_cell=1, velocity=[900.0, 0.0]),
         domain={"size": [2.4, 1.5], "origin": [-1.0, 0.0], "spacing": H},
-        time={"end": 1.0, "frames": 1},
-        bodies=[
-            {
-                "name": "bullet",
-                "material": {"law": "fluid", "density": 1000.0, "bulk_modulus": 1e4},
-                "shape": {"box": {"min": [1.0, 0.7], "max": [1.1, 0.8]}},
-                "particles_per_cell": 1,
-                "velocity": [900.0, 0.0],
-            }
-        ],
     )
     diagnosis = run_until_lost(build_run(lone, backend)).diagnosis
     assert (diagnosis.particle, diagnosis.body, diagnosis.step) == (0, "bullet", 1)
@@ -183,7 +156,7 @@ def test_frames_before_the_end_stay(fresh: Run, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr("mpmcli.solver.frames.recorder.ROOM", 1)
     frames = fresh.frames()
     kept = [next(frames) for _ in range(4)]
-    poison_deformation(fresh, "fluid", 3, np.nan)
+    poison(fresh, "fluid", 3, "deformation", np.nan)
     with pytest.raises(UnstableRunError):
         next(frames)
     with pytest.raises(StopIteration):

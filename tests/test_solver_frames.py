@@ -6,7 +6,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import taichi as ti
-from solver_state import bodies_of, scene_of
+from scenes import block, body, liquid, scene_of, solid
+from solver_state import bodies_of
 
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
@@ -17,16 +18,7 @@ from mpmcli.solver.frames.columns import FrameArrays, FrameColumns, RunConstants
 from mpmcli.solver.frames.diagnosis import read_group
 
 H = 0.1
-FIELDS = [
-    "velocity",
-    "density",
-    "pressure",
-    "volume_ratio",
-    "deformation_gradient",
-    "affine",
-    "stress",
-    "mass",
-]
+FIELDS = ["velocity", "density", "pressure", "volume_ratio", "deformation_gradient", "affine", "stress", "mass"]
 E, NU, K = 2e4, 0.3, 3e4
 GRAVITY = [0.3, -9.81]
 Frames = list[tuple[Frame, LedgerRow]]
@@ -34,7 +26,7 @@ Frames = list[tuple[Frame, LedgerRow]]
 
 def tumbling() -> Scene:
     """Return two drops and two blocks, given in turn, that fall, turn and hit the floor."""
-    fluid = {"law": "fluid", "density": 1000.0, "bulk_modulus": K}
+    fluid = liquid(K)
     solid = {"law": "neo_hookean", "density": 800.0, "youngs_modulus": E, "poissons_ratio": NU}
 
     def box(x: float, y: float) -> dict:
@@ -42,21 +34,14 @@ def tumbling() -> Scene:
 
     spin = [[0.0, -3.0], [3.0, 0.0]]
     return scene_of(
+        body("a", fluid, box(10.1, -4.8), velocity=[2.0, 0.0]),
+        body("b", solid, box(10.7, -4.6), velocity_gradient=spin),
+        body("c", {**fluid, "density": 500.0}, box(11.6, -4.7)),
+        body("d", {**solid, "density": 400.0}, box(12.4, -4.8), velocity=[-2.0, 1.0]),
         domain={"size": [3.0, 1.5], "origin": [10.0, -5.0], "spacing": H, "gravity": GRAVITY},
         time={"end": 0.6, "frames": 7},
-        solver={"precision": "f64"},
-        output={"fields": FIELDS},
-        bodies=[
-            {"name": "a", "material": fluid, "shape": box(10.1, -4.8), "velocity": [2.0, 0.0]},
-            {"name": "b", "material": solid, "shape": box(10.7, -4.6), "velocity_gradient": spin},
-            {"name": "c", "material": {**fluid, "density": 500.0}, "shape": box(11.6, -4.7)},
-            {
-                "name": "d",
-                "material": {**solid, "density": 400.0},
-                "shape": box(12.4, -4.8),
-                "velocity": [-2.0, 1.0],
-            },
-        ],
+        precision="f64",
+        fields=FIELDS,
     )
 
 
@@ -90,14 +75,10 @@ def test_one_launch_reads_what_the_fields_hold(run: Run, frames: Frames) -> None
         else:
             deformation = np.eye(d) + own(fields.displacement_gradient)
         expected = {
-            "x": own(fields.x),
-            "v": own(fields.v),
-            "C": own(fields.gradient)[:, :, :d].transpose(0, 2, 1),
-            "deformation": deformation,
-            "internal": np.array(internal).reshape(len(internal), group.count).T,
-            "id": own(fields.id),
-            "body": np.array(group.bodies)[place],
-        }
+            "x": own(fields.x), "v": own(fields.v), "C": own(fields.gradient)[:, :, :d].transpose(0, 2, 1),
+            "deformation": deformation, "internal": np.array(internal).reshape(len(internal), group.count).T,
+            "id": own(fields.id), "body": np.array(group.bodies)[place],
+        }  # fmt: skip
         assert found.keys() == expected.keys()
         for name, array in expected.items():
             assert found[name].shape == array.shape and np.array_equal(found[name], array), name
@@ -168,8 +149,8 @@ def test_every_row_is_the_same_particle_in_every_frame(frames: Frames, run: Run)
 def test_neighbours_of_a_lattice_stay_neighbours_in_a_solid(frames: Frames, run: Run) -> None:
     """In an elastic body x_q - x_p = F_p (X_q - X_p) to second order: rows, positions and F belong together."""
     first, last = frames[0][0], frames[-1][0]
-    for body in (1, 3):
-        rows = np.flatnonzero(first.body == body)
+    for b in (1, 3):
+        rows = np.flatnonzero(first.body == b)
         X, x = first.position[rows], last.position[rows]
         F = last.fields["deformation_gradient"][rows].reshape(-1, 2, 2)
         distance = np.linalg.norm(X[:, None] - X[None], axis=2)
@@ -259,17 +240,10 @@ def test_courant_number_is_that_of_the_fastest_particle(backend_of: Callable) ->
     """
     speed = 0.3
     scene = scene_of(
+        block("block", solid(1e6, density=1e5), [0.6, 0.0], [1.0, 0.4], velocity=[speed, 0.0]),
         domain={"size": [2.0, 1.0], "spacing": H, "walls": "slip"},
         time={"end": 0.05, "frames": 2},
-        solver={"precision": "f64"},
-        bodies=[
-            {
-                "name": "block",
-                "material": {"law": "neo_hookean", "density": 1e5, "youngs_modulus": 1e6},
-                "shape": {"box": {"min": [0.6, 0.0], "max": [1.0, 0.4]}},
-                "velocity": [speed, 0.0],
-            }
-        ],
+        precision="f64",
     )
     for _, row in list(build_run(scene, backend_of("f64")).frames())[1:]:
         assert row.courant_max == pytest.approx(speed * row.step_max / H, rel=1e-9)
@@ -292,17 +266,17 @@ def test_energies_of_bodies_at_rest(backend_of: Callable) -> None:
     data = tumbling().model_dump()
     data["domain"]["gravity"] = [0.0, 0.0]
     del data["domain"]["cells"]
-    for body in data["bodies"]:
-        body["velocity"] = [0.0, 0.0]
-        body["velocity_gradient"] = None
+    for one in data["bodies"]:
+        one["velocity"] = [0.0, 0.0]
+        one["velocity_gradient"] = None
     run = build_run(scene_of(**data), backend_of("f64"))
     start = bodies_of(run)
     for _ in range(500):
         run.step(2e-3)
-    for name, body in bodies_of(run).items():
-        assert np.array_equal(body.x, start[name].x)
-        assert np.array_equal(body.deformation, start[name].deformation)
-        assert not body.v.any()
+    for name, one in bodies_of(run).items():
+        assert np.array_equal(one.x, start[name].x)
+        assert np.array_equal(one.deformation, start[name].deformation)
+        assert not one.v.any()
 
 
 def falling(**time: object) -> dict:
@@ -311,13 +285,7 @@ def falling(**time: object) -> dict:
         "domain": {"size": [1.0, 1.0], "spacing": H, "gravity": [0.0, -9.81]},
         "time": {"end": 0.2, "frames": 4} | time,
         "solver": {"precision": "f64"},
-        "bodies": [
-            {
-                "name": "block",
-                "material": {"law": "neo_hookean", "density": 1e3, "youngs_modulus": 1e6},
-                "shape": {"box": {"min": [0.4, 0.5], "max": [0.6, 0.7]}},
-            }
-        ],
+        "bodies": [block("block", solid(1e6), [0.4, 0.5], [0.6, 0.7])],
     }
 
 

@@ -9,23 +9,18 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-import mpm_reference as reference
 import numpy as np
 import path_run
 import pytest
 from conftest import GPU, PythonRun
-from path_reference import Arrays, check_nodes, reference_groups
-from rounding import OF_A_STEP
+from path_reference import TOLERANCE, Arrays, check_steps
 
-from mpmcli.scene import Scene, sample_bodies
-from mpmcli.solver.transfer.splines import PAD
+from mpmcli.scene import sample_bodies
 
 CPU_THREADS = (1, 3)
 PATHS = [("cpu", threads) for threads in CPU_THREADS] + [(GPU, 1)]
 # In 3D one path is enough: the threads share the work as in 2D, where the same atomics add, too.
 SLOW = {(GPU, 1, 3), ("cpu", 1, 3)}
-# Round-off of a step relative to the largest value of each array.
-TOLERANCE = {"f32": OF_A_STEP, "f64": 1e-12}
 
 
 @pytest.fixture(scope="module")
@@ -59,44 +54,6 @@ def path_arrays(tmp_path_factory: pytest.TempPathFactory, run_module: Callable) 
 
         yield arrays
         pool.shutdown(cancel_futures=True)
-
-
-# Paths that agree to the last bit start a step from the same state, and need its answer only once.
-_answers: dict[bytes, tuple[np.ndarray, np.ndarray, np.ndarray, list[reference.Particles]]] = {}
-
-
-def reference_step(
-    groups: list[reference.Particles], box: reference.Box, dt: float, kick: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[reference.Particles]]:
-    """Return node momentum, mass and velocity, and the particles after the step."""
-    key = b"".join(a.tobytes() for g in groups for a in (g.x, g.v, g.C, g.deformation, np.asarray(g.kept)))
-    if key not in _answers:
-        momentum, mass = reference.scatter(groups, box, kick)
-        velocity, before = reference.update_both(momentum, mass, *reference.scatter_kept(groups, box), box, kick)
-        _answers[key] = (momentum, mass, velocity, reference.gather(groups, velocity, box, dt, before, kick))
-    return _answers[key]
-
-
-def check_steps(scene: Scene, arrays: Arrays, tolerance: float) -> None:
-    """Compare the nodes and the particles of every recorded step with the reference."""
-    gravity = np.array(scene.domain.gravity)
-    faces = scene.domain.walls.faces(scene.dimension)
-    box = reference.Box(scene.domain.cells, scene.domain.spacing, gravity, faces)
-    inside = tuple(slice(PAD - reference.MARGIN, PAD + n + 1 + reference.MARGIN) for n in box.cells)
-    for k in range(path_run.RECORDED):
-        groups = reference_groups(scene, arrays, k)
-        # Leapfrog: the first step brings the velocities to its middle, every further one to the next middle.
-        kick = path_run.STEP * (0.5 if k == 0 else 1.0)
-        momentum, mass, velocity, expected = reference_step(groups, box, path_run.STEP, kick)
-        fastest = np.abs(velocity).max()
-        for law, group in zip(("fluid", "neo_hookean"), expected, strict=True):
-            # C is (4/h) times differences of velocities, so their round-off is its measure.
-            scales = {"x": group.x.max(), "v": fastest, "C": 4 / box.spacing * fastest, "deformation": 1.0}
-            for name, scale in scales.items():
-                error = np.abs(arrays[f"{k + 1}_{law}_{name}"] - getattr(group, name)).max() / scale
-                assert error < tolerance, f"step {k}, {law} {name}: {error:.2e}"
-        nodes = arrays[f"{k}_nodes"][inside]
-        check_nodes(nodes, momentum, mass, velocity, kick * box.gravity, tolerance)
 
 
 def marked(*path: object) -> object:

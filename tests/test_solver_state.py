@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import state_run
-from scenes import block, scene
+from scenes import block, scene, slow
 
 from mpmcli.errors import InputError
 from mpmcli.materials.registry import laws
@@ -24,21 +24,13 @@ USUAL = ("total", "forces", "contact")
 
 @pytest.mark.parametrize(
     ("threads", "names"),
-    [
-        (3, USUAL),
-        pytest.param(1, state_run.NAMES, marks=pytest.mark.slow),
-        pytest.param(3, state_run.NAMES, marks=pytest.mark.slow),
-    ],
+    [(3, USUAL), slow(1, state_run.NAMES), slow(3, state_run.NAMES)],
     ids=["3 threads", "all, 1 thread", "all, 3 threads"],
 )
 def test_a_loaded_run_has_the_bytes_of_one_that_went_on(threads: int, names: tuple[str, ...]) -> None:
     """Save, 50 steps, load, 50 steps; and the same in another run of the scene, by a route through JSON."""
     done = subprocess.run(
-        [sys.executable, str(RUN), str(threads), *names],
-        capture_output=True,
-        text=True,
-        timeout=600,
-        check=True,
+        [sys.executable, str(RUN), str(threads), *names], capture_output=True, text=True, timeout=600, check=True
     )
     found = json.loads(done.stdout)
     assert found.keys() == set(names)

@@ -10,7 +10,7 @@ import numpy as np
 import path_run
 import pytest
 from conftest import GPU
-from scenes import block, restart, scene
+from scenes import block, restart, scene, slow
 
 from mpmcli.scene import sample_bodies
 from mpmcli.solver.engine.run import build_run
@@ -54,10 +54,7 @@ def test_a_lost_particle_ends_the_run_soon(outcome: dict) -> None:
     assert "particle 10" in lost["sentence"]
 
 
-@pytest.mark.parametrize(
-    "law",
-    ["neo_hookean", "viscoplastic", *(pytest.param(n, marks=pytest.mark.slow) for n in ("fixed_corotated", "snow"))],
-)
+@pytest.mark.parametrize("law", ["neo_hookean", "viscoplastic", *(slow(n) for n in ("fixed_corotated", "snow"))])
 def test_no_step_exceeds_the_limit_of_its_moment(law: str, backend_of: Callable, record_property: Callable) -> None:
     """A block hits a wall at a fifth of its wave speed: no step is longer than the state then allows.
 
@@ -89,9 +86,7 @@ def test_no_step_exceeds_the_limit_of_its_moment(law: str, backend_of: Callable,
     assert smallest < 0.95 * at_start
 
 
-@pytest.mark.parametrize(
-    "law", ["fluid", *(pytest.param(n, marks=pytest.mark.slow) for n in ("viscoplastic", "neo_hookean"))]
-)
+@pytest.mark.parametrize("law", ["fluid", *(slow(n) for n in ("viscoplastic", "neo_hookean"))])
 def test_the_step_does_not_drive_what_it_follows(law: str, backend_of: Callable) -> None:
     """A lone particle that takes tension oscillates for 1,000 steps of the solver's own choice, let go at three J.
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import block, scene
+from scenes import ball, block, body, scene, slow
 from test_batch import SCENES, scene_named
 from test_emitters import SPACING, jet_scene
 
@@ -51,7 +51,7 @@ def largest_difference(found: Sequence[Frame], expected: Sequence[Frame]) -> flo
 
 def drop(cells: int = 24, **more: object) -> Scene:
     """Return a drop that falls to pieces on a floor, in a domain that is nearly empty."""
-    drop = {"name": "drop", "material": FLUID, "shape": {"ball": {"center": [0.6, 0.3], "radius": 0.1}}}
+    drop = body("drop", FLUID, ball([0.6, 0.3], 0.1))
     return changed(
         scene((cells, cells), 1 / cells, [drop | {"velocity": [3.0, -4.0]}], 0.1, frames=4, gravity=(0, -9.81)),
         **{"grid": "sparse"} | more,
@@ -60,9 +60,7 @@ def drop(cells: int = 24, **more: object) -> Scene:
 
 @settings(max_examples=60, deadline=None)
 @given(
-    cells=st.integers(8, 40),
-    kind=st.sampled_from([(4, 1, 3), (6, 2, 3), (5, 1, 4), (7, 2, 4)]),
-    repeats=st.booleans(),
+    cells=st.integers(8, 40), kind=st.sampled_from([(4, 1, 3), (6, 2, 3), (5, 1, 4), (7, 2, 4)]), repeats=st.booleans()
 )
 def test_what_particles_of_a_tile_write_is_reached(cells: int, kind: tuple[int, int, int], repeats: bool) -> None:
     """Nodes of every stencil that drifted as far as it may, and their images behind walls or across the domain."""
@@ -116,9 +114,7 @@ def test_the_kernel_numbers_the_same_tiles(backend_of: Callable) -> None:
         assert not nodes.to_numpy()[:size].any()
 
 
-@pytest.mark.parametrize(
-    "name", [*USUAL, *(pytest.param(name, marks=pytest.mark.slow) for name in SCENES if name not in USUAL)]
-)
+@pytest.mark.parametrize("name", [*USUAL, *(slow(name) for name in SCENES if name not in USUAL)])
 def test_results_are_those_of_a_dense_grid(backend_of: Callable, name: str) -> None:
     """Sums are in another order, in double precision."""
     start = changed(scene_named(name), precision="f64")
@@ -139,7 +135,7 @@ def test_a_grid_grows_with_what_particles_reach(backend_of: Callable, monkeypatc
     assert len(grown) >= 2
 
 
-@pytest.mark.parametrize("room", [pytest.param(5, marks=pytest.mark.slow), 5_000])
+@pytest.mark.parametrize("room", [slow(5), 5_000])
 def test_a_loaded_run_goes_on_with_the_same_bytes(
     backend_of: Callable, monkeypatch: pytest.MonkeyPatch, room: int
 ) -> None:
@@ -179,7 +175,7 @@ def test_scenes_choose_their_grid() -> None:
 
     Bodies that separate need a dense one.
     """
-    ball = {"name": "ball", "material": FLUID, "shape": {"ball": {"center": [0.5] * 3, "radius": 0.06}}}
+    ball = body("ball", FLUID, {"ball": {"center": [0.5] * 3, "radius": 0.06}})
     large = scene((512,) * 3, 1 / 512, [ball], 0.1)
     assert wants_sparse(large)
     assert not wants_sparse(changed(large, grid="dense"))
@@ -194,7 +190,7 @@ def test_scenes_choose_their_grid() -> None:
 
 def test_memory_is_that_of_what_is_occupied() -> None:
     """A million particles in 1024^3 cells take less than 1 GiB, fine nodes included; a dense grid would take 17 GB."""
-    ball = {"name": "ball", "material": FLUID, "shape": {"ball": {"center": [0.5] * 3, "radius": 31 / 1024}}}
+    ball = body("ball", FLUID, {"ball": {"center": [0.5] * 3, "radius": 31 / 1024}})
     plans = [
         make_plan(scene_in, Backend("cpu", 2, "f32", False))
         for scene_in in (changed(scene((1024,) * 3, 1 / 1024, [ball], 0.1), grid=grid) for grid in ("sparse", "dense"))

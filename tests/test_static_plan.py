@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Callable
 
 import pytest
-from solver_state import scene_of
+from scenes import block, body, scene_of
 from taichi.lang import impl, kernel_impl
 
 from mpmcli.scene import Scene
@@ -34,9 +34,7 @@ def scene(*, with_features: bool) -> Scene:
     tables = {
         "domain": {"size": [1.0, 1.0], "spacing": 0.1, "gravity": [0.0, -9.81], "walls": "separate"},
         "time": {"end": 1.0, "frames": 1, "step": 1e-4},
-        "bodies": [
-            {"name": "pool", "material": WATER, "shape": {"box": {"min": [0.0, 0.0], "max": [1.0, 0.4]}}},
-        ],
+        "bodies": [block("pool", WATER, [0.0, 0.0], [1.0, 0.4])],
     }
     if not with_features:
         tables["solver"] = {"redistribute": False}
@@ -49,7 +47,7 @@ def scene(*, with_features: bool) -> Scene:
         ball = {"ball": {"center": [0.3, 0.6], "radius": 0.15}}
         tables["colliders"] = [{"name": "ball", "shape": ball, "velocity": ["t", 0.0]}]
         mouth = {"ball": {"center": [0.75, 0.75], "radius": 0.1}}
-        tables["emitters"] = [{"name": "jet", "material": WATER, "shape": mouth, "velocity": [0.0, -1.0]}]
+        tables["emitters"] = [body("jet", WATER, mouth, velocity=[0.0, -1.0])]
         tables["forces"] = [{"acceleration": ["x * sin(t)", 0.0]}]
     return scene_of(**tables)
 

@@ -4,8 +4,8 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from scenes import block, scene
-from solver_state import bodies_of, scene_of
+from scenes import block, scene, scene_of
+from solver_state import bodies_of
 
 from mpmcli.solver.engine.run import Run, build_run
 from mpmcli.solver.engine.run_state import Layout, RunState
@@ -99,11 +99,10 @@ def test_no_step_skips_a_pulse(step: float, backend_of: Callable) -> None:
     gravity = (0.0, f"-5000 if {PULSE} else -9.81")
     force = {"acceleration": [f"3000 if {PULSE} and x < 0.5 else 0", 0.0]}
     asked = scene_of(
+        block("cloud", CLOUD, [0.4, 0.5], [0.6, 0.7]),
         domain={"size": [1.0, 1.0], "spacing": 0.1, "gravity": list(gravity)},
-        time={"end": 1.0, "frames": 1},
-        bodies=[block("cloud", CLOUD, [0.4, 0.5], [0.6, 0.7])],
         forces=[force],
-        solver={"precision": "f64"},
+        precision="f64",
     )
     run = build_run(asked, backend_of("f64"))
     while run.time < 0.03:

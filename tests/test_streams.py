@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
-from solver_state import scene_of
+from scenes import ball, block, body, box, scene_of, slow
 
 from mpmcli.scene import Scene
 from mpmcli.solver.engine.run import build_run
@@ -27,6 +27,7 @@ def poured(
     """Return a scene of 12 x 24 cm with a body of a liquid; the ceiling holds it, or where gravity is up, the floor."""
     held, open_face = ("y_max", "y_min") if gravity <= 0 else ("y_min", "y_max")
     return scene_of(
+        body("body", material, shape) | more.pop("body", {}),
         domain={
             "size": [0.12, 0.24],
             "spacing": SPACING,
@@ -34,8 +35,7 @@ def poured(
             "walls": {"default": "separate", held: "stick", open_face: "open"},
         },
         time={"end": end, "frames": 10, "safety": safety},
-        bodies=[{"name": "body", "material": material, "shape": shape} | more.pop("body", {})],
-        output={"fields": ["velocity", "volume_ratio"]},
+        fields=["velocity", "volume_ratio"],
         **more,
     )
 
@@ -43,18 +43,14 @@ def poured(
 def poured_in_3d(material: dict, radius: float, speed: float, end: float, floor: str) -> Scene:
     """Return a scene of 12 x 12 x 24 cm with a round tap at 20 cm, over a thin pool of the same liquid."""
     mouth = {"cylinder": {"base": [0.06, 0.06, 0.2], "axis": [0, 0, 1], "radius": radius, "height": 0.012}}
-    pool = {"box": {"min": [0.03, 0.03, 0.0], "max": [0.09, 0.09, 0.006]}}
+    pool = box([0.03, 0.03, 0.0], [0.09, 0.09, 0.006])
     return scene_of(
-        domain={
-            "size": [0.12, 0.12, 0.24],
-            "spacing": SPACING,
-            "gravity": [0, 0, -9.81],
-            "walls": {"default": "separate", "z_min": floor},
-        },
+        body("pool", material, pool),
+        domain={"size": [0.12, 0.12, 0.24], "spacing": SPACING, "gravity": [0, 0, -9.81]},
+        walls={"default": "separate", "z_min": floor},
         time={"end": end, "frames": 12},
-        bodies=[{"name": "pool", "material": material, "shape": pool}],
-        emitters=[{"name": "tap", "material": material, "shape": mouth, "velocity": [0, 0, -speed]}],
-        output={"fields": ["velocity", "volume_ratio"]},
+        emitters=[body("tap", material, mouth, velocity=[0, 0, -speed])],
+        fields=["velocity", "volume_ratio"],
     )
 
 
@@ -79,18 +75,13 @@ def test_water_that_a_tide_draws_out_keeps_its_volume(backend: Backend, sampling
     its width, and J is cosh(s t). The suction is rho s^2 w^2 / 8, an eighth of the strength of this water.
     """
     s, middle, half = 20.0, np.full(2, 0.12) + shift * SPACING, np.array([4 * SPACING, 0.07])
-    column = {
-        "name": "column",
-        "material": WATER,
-        "shape": {"box": {"min": list(middle - half), "max": list(middle + half)}},
-        "sampling": sampling,
-    }
+    column = block("column", WATER, list(middle - half), list(middle + half), sampling=sampling)
     asked = scene_of(
+        column,
         domain={"size": [0.24, 0.24], "spacing": SPACING, "walls": "open"},
         time={"end": 1 / s, "frames": 5},
-        bodies=[column],
         forces=[{"acceleration": ["0", f"{s**2} * (y - {middle[1]})"]}],
-        output={"fields": ["velocity", "volume_ratio"]},
+        fields=["velocity", "volume_ratio"],
     )
     for frame, _ in build_run(asked, backend).frames():
         stretch, (x, y) = np.cosh(s * frame.time), (frame.position - middle).astype(float).T
@@ -99,10 +90,7 @@ def test_water_that_a_tide_draws_out_keeps_its_volume(backend: Backend, sampling
         assert frame.fields["volume_ratio"][own].mean() == pytest.approx(1.0, abs=0.02)
 
 
-@pytest.mark.parametrize(
-    ("up", "safety"),
-    [(0, 0.8), pytest.param(0, 0.4, marks=pytest.mark.slow), pytest.param(1, 0.8, marks=pytest.mark.slow)],
-)
+@pytest.mark.parametrize(("up", "safety"), [(0, 0.8), slow(0, 0.4), slow(1, 0.8)])
 def test_water_that_is_poured_thins_as_fast_as_it_falls(
     backend: Backend, up: int, safety: float, record_property: Callable
 ) -> None:
@@ -112,9 +100,9 @@ def test_water_that_is_poured_thins_as_fast_as_it_falls(
     of the kernel: 1.4 times as wide.
     """
     sign = 1 - 2 * up
-    mouth = {"box": {"min": [0.036, (0.188, 0.028)[up]], "max": [0.084, (0.212, 0.052)[up]]}}
-    tap = {"name": "tap", "material": WATER, "shape": mouth, "velocity": [0.0, -0.4 * sign]}
-    drop = {"box": {"min": [0.0, 0.0], "max": [0.012, 0.012]}}
+    mouth = box([0.036, (0.188, 0.028)[up]], [0.084, (0.212, 0.052)[up]])
+    tap = body("tap", WATER, mouth, velocity=[0.0, -0.4 * sign])
+    drop = box([0.0, 0.0], [0.012, 0.012])
     scene = poured(WATER, drop, gravity=-9.81 * sign, safety=safety, emitters=[tap])
     found = []
     for frame, _ in build_run(scene, backend).frames():
@@ -134,9 +122,9 @@ def test_a_wide_and_slow_stream_is_drawn_together(backend: Backend) -> None:
     times as wide. What has passed the mouth is the rate times the time, and the nozzle is full at the end.
     """
     water = WATER | {"bulk_modulus": "auto"}
-    mouth = {"box": {"min": [0.012, 0.188], "max": [0.108, 0.212]}}
-    tap = {"name": "tap", "material": water, "shape": mouth, "velocity": [0.0, -0.2]}
-    drop = {"box": {"min": [0.0, 0.0], "max": [0.012, 0.012]}}
+    mouth = box([0.012, 0.188], [0.108, 0.212])
+    tap = body("tap", water, mouth, velocity=[0.0, -0.2])
+    drop = box([0.0, 0.0], [0.012, 0.012])
     found = []
     # The nozzle is filled in the first step.
     for frame, row in list(build_run(poured(water, drop, emitters=[tap]), backend).frames())[1:]:
@@ -152,10 +140,10 @@ def test_a_wide_and_slow_stream_is_drawn_together(backend: Backend) -> None:
 @pytest.mark.slow
 def test_water_poured_into_a_glass(backend: Backend, record_property: Callable) -> None:
     """Width times speed is that at the mouth, 40 mm at 0.5 m/s, to 10 %; its depth that of what was poured, to 2 %."""
-    glass = {"box": {"min": [0.08, 0.02], "max": [0.24, 0.24]}}
-    hollow = {"box": {"min": [0.1, 0.04], "max": [0.22, 0.3]}}
-    mouth = {"box": {"min": [0.14, 0.42], "max": [0.18, 0.44]}}
-    tap = {"name": "tap", "material": "water", "shape": mouth, "velocity": [0.0, -0.5], "volume": 0.016}
+    glass = box([0.08, 0.02], [0.24, 0.24])
+    hollow = box([0.1, 0.04], [0.22, 0.3])
+    mouth = box([0.14, 0.42], [0.18, 0.44])
+    tap = body("tap", "water", mouth, velocity=[0.0, -0.5], volume=0.016)
     scene = scene_of(
         domain={"size": [0.32, 0.48], "spacing": 0.01, "gravity": [0.0, -9.81], "walls": "open"},
         time={"end": 1.6, "frames": 32},
@@ -197,9 +185,9 @@ def test_honey_thins_as_fast_as_it_falls(backend: Backend) -> None:
 
     A mouth of 24 mm, 0.2 m/s, from which it falls 15 cm, later than by itself, because it hangs on what follows.
     """
-    mouth = {"box": {"min": [0.048, 0.188], "max": [0.072, 0.212]}}
-    spoon = {"name": "spoon", "material": HONEY, "shape": mouth, "velocity": [0.0, -0.2]}
-    scene = poured(HONEY, {"box": {"min": [0.0, 0.0], "max": [0.012, 0.012]}}, end=1.0, emitters=[spoon])
+    mouth = box([0.048, 0.188], [0.072, 0.212])
+    spoon = body("spoon", HONEY, mouth, velocity=[0.0, -0.2])
+    scene = poured(HONEY, box([0.0, 0.0], [0.012, 0.012]), end=1.0, emitters=[spoon])
     found, ratios = [], []
     for frame, _ in build_run(scene, backend).frames():
         if frame.time > 0.65:
@@ -238,7 +226,7 @@ def test_honey_from_a_spoon_is_a_thinning_rope(backend: Backend) -> None:
 
 def test_a_hanging_drop_stretches_to_a_thread_and_falls(backend: Backend) -> None:
     """It falls more slowly than freely, keeps its volume to 10 %, and leaves a part of itself at the ceiling."""
-    scene = poured(HONEY, {"box": {"min": [0.03, 0.2], "max": [0.09, 0.24]}}, end=0.24)
+    scene = poured(HONEY, box([0.03, 0.2], [0.09, 0.24]), end=0.24)
     start, *_, (frame, _) = build_run(scene, backend).frames()
     x = frame.position[frame.fields["status"] == 1]
     assert 0.2 * 4.905 * 0.24**2 < start[0].position[:, 1].mean() - x[:, 1].mean() < 0.95 * 4.905 * 0.24**2
@@ -256,7 +244,7 @@ def test_a_drop_on_which_nothing_acts_keeps_its_shape(backend: Backend, sampling
     A random sample has a few nodes with too much volume, whose particles spread by 0.016 h.
     """
     body = {"velocity": [0.1, 0.0], "sampling": sampling}
-    scene = poured(HONEY, {"ball": {"center": [0.035, 0.12], "radius": 0.02}}, gravity=0.0, body=body)
+    scene = poured(HONEY, ball([0.035, 0.12], 0.02), gravity=0.0, body=body)
     first, *_, last = (frame for frame, _ in build_run(scene, backend).frames())
     moved = last.position.astype(float) - first.position
     assert np.abs(moved - [0.05, 0.0]).max() < most * SPACING

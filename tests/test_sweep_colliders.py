@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from good_sweep import BASE, LAWS, refusal, sweep_of
+from scenes import plane
 from test_placement import assert_well_placed, solids_of
 
 from mpmcli.dataset.draw import draw, room_before
@@ -96,34 +97,24 @@ def test_bodies_lie_where_they_would_without_placed_colliders() -> None:
 def test_room_before_a_wall_is_that_of_the_nearest_corner() -> None:
     centers = np.array([[0.5, 0.5], [0.1, 0.5]])
     wall = Collider.model_validate(
-        {"name": "w", "shape": {"plane": {"point": [0.0, 0.0], "normal": [1.0, 0.0]}}},
-        context={"dimension": 2, "constants": {}},
+        {"name": "w", "shape": plane([0.0, 0.0], [1.0, 0.0])}, context={"dimension": 2, "constants": {}}
     )
     assert room_before(centers, np.array([0.05, 0.3]), 0.0, wall.signed_distance) == pytest.approx([0.45, 0.05])
     assert room_before(centers, np.zeros(2), 0.2, wall.signed_distance) == pytest.approx([0.3, -0.1])
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "said"),
-    [
-        (
-            'collider = "post"',
-            'collider = "pots"',
-            'no collider of the base scene has the name "pots"; did you mean "post"?',
-        ),
-        ('collider = "post"', 'collider = "slope"', 'must be a box or a ball; "slope" is a plane'),
-        ('collider = "post"', 'collider = "post"\nbody = "sand"', "must be the name of a body, or collider that of a"),
-        ("count = { integers = [1, 4] }", "count = { integers = [-1, 4] }", "must be whole numbers from 0 to 1000"),
-        ("[0.1, 0.4]", "[-0.1, 0.4]", "must be at least 0; found -0.1"),
-        ('"colliders.slope.friction"', '"colliders.slope"', "a collider or a force holds"),
-        ('"colliders.slope.friction"', '"colliders.post.shape.ball.radius"', 'the placement of "post" sets as well'),
-        (
-            "radius = { uniform = [0.03, 0.06] }",
-            "radius = 0.4\nsize = [0.1, 0.1]",
-            '"post" is a ball, which has no size',
-        ),
-    ],
-)
+@pytest.mark.parametrize(("old", "new", "said"), [
+    ('collider = "post"', 'collider = "pots"',
+     'no collider of the base scene has the name "pots"; did you mean "post"?'),
+    ('collider = "post"', 'collider = "slope"', 'must be a box or a ball; "slope" is a plane'),
+    ('collider = "post"', 'collider = "post"\nbody = "sand"', "must be the name of a body, or collider that of a"),
+    ("count = { integers = [1, 4] }", "count = { integers = [-1, 4] }", "must be whole numbers from 0 to 1000"),
+    ("[0.1, 0.4]", "[-0.1, 0.4]", "must be at least 0; found -0.1"),
+    ('"colliders.slope.friction"', '"colliders.slope"', "a collider or a force holds"),
+    ('"colliders.slope.friction"', '"colliders.post.shape.ball.radius"', 'the placement of "post" sets as well'),
+    ("radius = { uniform = [0.03, 0.06] }", "radius = 0.4\nsize = [0.1, 0.1]",
+     '"post" is a ball, which has no size'),
+])  # fmt: skip
 def test_a_faulty_placement_of_a_collider_is_named(old: str, new: str, said: str) -> None:
     assert said in "\n".join(refusal(SWEEP.replace(old, new, 1), WITH))
 

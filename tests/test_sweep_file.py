@@ -83,19 +83,11 @@ def test_the_key_is_of_the_content_alone(tmp_path, monkeypatch):
     assert sweep_of(SWEEP).key == key
 
 
-@pytest.mark.parametrize(
-    ("old", "new"),
-    [
-        ("count = 1000", "count = 1001"),
-        ("seed = 7", "seed = 8"),
-        ("seed = 7", 'seed = 7\nmethod = "sobol"'),
-        ("seed = 7", 'seed = 7\naccept = "suspect"'),
-        ("[25, 40]", "[25, 41]"),
-        ("[1, 3]", "[1, 2]"),
-        ("0.02", "0.03"),
-        ("train = 0.8\nvalid = 0.1", "train = 0.7\nvalid = 0.2"),
-    ],
-)
+@pytest.mark.parametrize(("old", "new"), [
+    ("count = 1000", "count = 1001"), ("seed = 7", "seed = 8"), ("seed = 7", 'seed = 7\nmethod = "sobol"'),
+    ("seed = 7", 'seed = 7\naccept = "suspect"'), ("[25, 40]", "[25, 41]"), ("[1, 3]", "[1, 2]"), ("0.02", "0.03"),
+    ("train = 0.8\nvalid = 0.1", "train = 0.7\nvalid = 0.2"),
+])  # fmt: skip
 def test_the_key_changes_with_the_content(old, new):
     assert old in SWEEP
     assert sweep_of(SWEEP.replace(old, new)).key != sweep_of(SWEEP).key
@@ -107,29 +99,20 @@ def test_the_key_changes_with_the_base_scene_and_with_the_order_of_grids():
     assert sweep_of(varied(*grids)).key != sweep_of(varied(*reversed(grids))).key
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "sentence"),
-    [
-        ("count = 1000", "cuont = 1000", 'sweep.toml:2: cuont: unknown key; did you mean "count"?'),
-        ("count = 1000", "count = 0", "sweep.toml:2: count: must be at least 1; found 0"),
-        ("seed = 7", "seed = -1", "sweep.toml:3: seed: must be at least 0; found -1"),
-        (
-            "seed = 7",
-            'method = "sobl"',
-            'sweep.toml:3: method: must be "random", "sobol" or "latin"; found "sobl"; did you mean "sobol"?',
-        ),
-        ("seed = 7", 'accept = "all"', 'sweep.toml:3: accept: must be "stable" or "suspect"; found "all"'),
-        ('"base.toml"', '"bse.toml"', "sweep.toml:1: base: there is no such file: neither bse.toml nor "),
-        ('base = "base.toml"', "", 'sweep.toml: base: missing key: the base scene, such as base = "scene.toml"'),
-        ('"base.toml"', "3", "sweep.toml:1: base: must be text in quotes; found 3"),
-        (
-            "train = 0.8",
-            "train = 0.7",
-            "sweep.toml:14: split: must make 1 together, as train = 0.8, valid = 0.1, test = 0.1 do; found 0.9",
-        ),
-        ("valid = 0.1", "vaild = 0.1", 'sweep.toml:16: split.vaild: unknown key; did you mean "valid"?'),
-    ],
-)
+@pytest.mark.parametrize(("old", "new", "sentence"), [
+    ("count = 1000", "cuont = 1000", 'sweep.toml:2: cuont: unknown key; did you mean "count"?'),
+    ("count = 1000", "count = 0", "sweep.toml:2: count: must be at least 1; found 0"),
+    ("seed = 7", "seed = -1", "sweep.toml:3: seed: must be at least 0; found -1"),
+    ("seed = 7", 'method = "sobl"',
+     'sweep.toml:3: method: must be "random", "sobol" or "latin"; found "sobl"; did you mean "sobol"?'),
+    ("seed = 7", 'accept = "all"', 'sweep.toml:3: accept: must be "stable" or "suspect"; found "all"'),
+    ('"base.toml"', '"bse.toml"', "sweep.toml:1: base: there is no such file: neither bse.toml nor "),
+    ('base = "base.toml"', "", 'sweep.toml: base: missing key: the base scene, such as base = "scene.toml"'),
+    ('"base.toml"', "3", "sweep.toml:1: base: must be text in quotes; found 3"),
+    ("train = 0.8", "train = 0.7",
+     "sweep.toml:14: split: must make 1 together, as train = 0.8, valid = 0.1, test = 0.1 do; found 0.9"),
+    ("valid = 0.1", "vaild = 0.1", 'sweep.toml:16: split.vaild: unknown key; did you mean "valid"?'),
+])  # fmt: skip
 def test_a_faulty_table_is_named(old, new, sentence):
     assert old in SWEEP
     assert any(line.startswith(sentence) for line in refusal(SWEEP.replace(old, new)))
@@ -150,123 +133,76 @@ def test_all_faults_come_at_once_in_the_order_of_the_file():
     ]
 
 
-@pytest.mark.parametrize(
-    ("value", "sentence"),
-    [
-        ("{ unifrm = [1, 2] }", '.unifrm: unknown key; did you mean "uniform"?'),
-        (
-            "{ gaussian = [1, 2] }",
-            ".gaussian: unknown key; the distributions are uniform, loguniform, normal, integers, choice and grid",
-        ),
-        (
-            "{}",
-            ": must be a distribution, uniform, loguniform, normal, integers, choice or grid, or a value; found an "
-            "empty table",
-        ),
-        (
-            "{ a = { b = 1 } }",
-            ': must be a distribution or a value; a key with dots stands in quotes, "domain.gravity"',
-        ),
-        ("{ uniform = [1, 2], grid = [1] }", ': is one distribution, and "uniform" and "grid" are 2; keep one of them'),
-        ("{ uniform = [1, 2], within = [1, 2] }", ".within: unknown key; uniform takes no other key"),
-        ("{ normal = [1, 2], wihtin = [1, 2] }", '.wihtin: unknown key; did you mean "within"?'),
-        ("{ uniform = [2, 1] }", ".uniform: must be [lower, upper]; found 2 above 1"),
-        (
-            "{ uniform = [1, nan] }",
-            ".uniform: must be two numbers, or two lists of numbers of the same length; found [1, nan]",
-        ),
-        (
-            "{ uniform = [1, 2, 3] }",
-            ".uniform: must be two numbers, or two lists of numbers of the same length; found [1, 2, 3]",
-        ),
-        (
-            "{ uniform = [[1, 2], 3] }",
-            ".uniform: must be two numbers, or two lists of numbers of the same length; found [[1, 2], 3]",
-        ),
-        (
-            "{ uniform = [[1, 2], [3]] }",
-            ".uniform: must be two numbers, or two lists of numbers of the same length; found [[1, 2], [3]]",
-        ),
-        (
-            '{ uniform = ["a", true] }',
-            '.uniform: must be two numbers, or two lists of numbers of the same length; found ["a", true]',
-        ),
-        ("{ loguniform = [0, 1] }", ".loguniform: needs bounds greater than 0; found 0"),
-        ("{ integers = [1, 2.5] }", ".integers: needs whole numbers; found [1, 2.5]"),
-        ("{ choice = [] }", ".choice: must be a list with at least one value; found []"),
-        ("{ grid = 3 }", ".grid: must be a list with at least one value; found 3"),
-        ("{ normal = [1, 0] }", ".normal: is [mean, standard deviation], and a deviation is greater than 0; found [0]"),
-        ("{ normal = [1, 2], within = [3, 2] }", ".within: must be [min, max] around values that occur; found [3, 2]"),
-        (
-            "{ normal = [0, 1], within = [50, 60] }",
-            ".within: must be [min, max] around values that occur; found [50, 60]",
-        ),
-        (
-            "{ normal = [0, 1], within = [[1], [2]] }",
-            ".within: must be two bounds of the same kind as mean and standard deviation",
-        ),
-    ],
-)
+@pytest.mark.parametrize(("value", "sentence"), [
+    ("{ unifrm = [1, 2] }", '.unifrm: unknown key; did you mean "uniform"?'),
+    ("{ gaussian = [1, 2] }",
+     ".gaussian: unknown key; the distributions are uniform, loguniform, normal, integers, choice and grid"),
+    ("{}", ": must be a distribution, uniform, loguniform, normal, integers, choice or grid, or a value; found an "
+     "empty table"),
+    ("{ a = { b = 1 } }",
+     ': must be a distribution or a value; a key with dots stands in quotes, "domain.gravity"'),
+    ("{ uniform = [1, 2], grid = [1] }", ': is one distribution, and "uniform" and "grid" are 2; keep one of them'),
+    ("{ uniform = [1, 2], within = [1, 2] }", ".within: unknown key; uniform takes no other key"),
+    ("{ normal = [1, 2], wihtin = [1, 2] }", '.wihtin: unknown key; did you mean "within"?'),
+    ("{ uniform = [2, 1] }", ".uniform: must be [lower, upper]; found 2 above 1"),
+    ("{ uniform = [1, nan] }",
+     ".uniform: must be two numbers, or two lists of numbers of the same length; found [1, nan]"),
+    ("{ uniform = [1, 2, 3] }",
+     ".uniform: must be two numbers, or two lists of numbers of the same length; found [1, 2, 3]"),
+    ("{ uniform = [[1, 2], 3] }",
+     ".uniform: must be two numbers, or two lists of numbers of the same length; found [[1, 2], 3]"),
+    ("{ uniform = [[1, 2], [3]] }",
+     ".uniform: must be two numbers, or two lists of numbers of the same length; found [[1, 2], [3]]"),
+    ('{ uniform = ["a", true] }',
+     '.uniform: must be two numbers, or two lists of numbers of the same length; found ["a", true]'),
+    ("{ loguniform = [0, 1] }", ".loguniform: needs bounds greater than 0; found 0"),
+    ("{ integers = [1, 2.5] }", ".integers: needs whole numbers; found [1, 2.5]"),
+    ("{ choice = [] }", ".choice: must be a list with at least one value; found []"),
+    ("{ grid = 3 }", ".grid: must be a list with at least one value; found 3"),
+    ("{ normal = [1, 0] }", ".normal: is [mean, standard deviation], and a deviation is greater than 0; found [0]"),
+    ("{ normal = [1, 2], within = [3, 2] }", ".within: must be [min, max] around values that occur; found [3, 2]"),
+    ("{ normal = [0, 1], within = [50, 60] }",
+     ".within: must be [min, max] around values that occur; found [50, 60]"),
+    ("{ normal = [0, 1], within = [[1], [2]] }",
+     ".within: must be two bounds of the same kind as mean and standard deviation"),
+])  # fmt: skip
 def test_a_faulty_distribution_is_named(value, sentence):
     assert refusal(varied(f'"time.end" = {value}')) == [f"sweep.toml:6: vary.time.end{sentence}"]
 
 
-@pytest.mark.parametrize(
-    ("line", "sentence"),
-    [
-        ('"time.ned" = 0.5', 'time.ned: unknown key; did you mean "end"?'),
-        (
-            '"bodies.sand.material.fricton_angle" = { uniform = [20, 30] }',
-            'bodies.sand.material.fricton_angle: unknown key; did you mean "friction_angle"?',
-        ),
-        (
-            '"bodies.snad.velocity" = [1, 0]',
-            'bodies.snad.velocity: no entry of bodies has the name "snad"; did you mean "sand"?',
-        ),
-        (
-            '"bodies.5.velocity" = [1, 0]',
-            "bodies.5.velocity: bodies has 2 entries, counted from 0; there is no bodies[5]",
-        ),
-        (
-            '"time..end" = 1',
-            'time..end: "time..end" is not a key; a key is a path such as time.end or bodies[0].velocity',
-        ),
-        (
-            '"bodies.sand.name" = "a"',
-            "bodies.sand.name: vary what a body, a collider or a force holds, such as bodies.NAME.velocity, "
-            "and not its name",
-        ),
-        (
-            '"bodies.sand" = 3',
-            "bodies.sand: vary what a body, a collider or a force holds, such as bodies.NAME.velocity, "
-            "and not its name",
-        ),
-    ],
-)
+@pytest.mark.parametrize(("line", "sentence"), [
+    ('"time.ned" = 0.5', 'time.ned: unknown key; did you mean "end"?'),
+    ('"bodies.sand.material.fricton_angle" = { uniform = [20, 30] }',
+     'bodies.sand.material.fricton_angle: unknown key; did you mean "friction_angle"?'),
+    ('"bodies.snad.velocity" = [1, 0]',
+     'bodies.snad.velocity: no entry of bodies has the name "snad"; did you mean "sand"?'),
+    ('"bodies.5.velocity" = [1, 0]',
+     "bodies.5.velocity: bodies has 2 entries, counted from 0; there is no bodies[5]"),
+    ('"time..end" = 1',
+     'time..end: "time..end" is not a key; a key is a path such as time.end or bodies[0].velocity'),
+    ('"bodies.sand.name" = "a"',
+     "bodies.sand.name: vary what a body, a collider or a force holds, such as bodies.NAME.velocity, "
+     "and not its name"),
+    ('"bodies.sand" = 3', "bodies.sand: vary what a body, a collider or a force holds, such as bodies.NAME.velocity, "
+     "and not its name"),
+])  # fmt: skip
 def test_a_key_that_is_not_in_the_base_scene_is_one_sentence(line, sentence):
     assert refusal(varied(line)) == [f"sweep.toml:6: vary.{sentence}"]
 
 
-@pytest.mark.parametrize(
-    ("line", "sentence"),
-    [
-        # Both ends are tried, whatever trajectory 0 draws.
-        ('"bodies.sand.material.friction_angle" = { uniform = [-1, 40] }', "must be greater than 0; found -1.0"),
-        ('"bodies.sand.material.friction_angle" = { uniform = [20, 95] }', "must be less than 90; found 95.0"),
-        ('"time.frames" = { integers = [0, 1000] }', "must be at least 1; found 0"),
-        ('"time.frames" = { grid = [9, 8, 7, 6, -5] }', "must be at least 1; found -5"),
-        ('"time.end" = { normal = [1, 0.5] }', "must be greater than 0; found -0.5"),
-        (
-            '"bodies.stone.velocity" = { uniform = [[0, 0, 0], [1, 1, 1]] }',
-            "needs two numbers in this 2D scene (as many as domain.size); found 3",
-        ),
-        (
-            '"bodies.stone.shape.ball.center.0" = { choice = [0.7, 0.8, 0.95] }',
-            'with 0.95: bodies[1].shape: body "stone" leaves the domain through x_max by 0.05 m (it reaches x = 1.05, '
-            "the face is at 1); move it or enlarge the domain",
-        ),
-    ],
-)
+@pytest.mark.parametrize(("line", "sentence"), [
+    # Both ends are tried, whatever trajectory 0 draws.
+    ('"bodies.sand.material.friction_angle" = { uniform = [-1, 40] }', "must be greater than 0; found -1.0"),
+    ('"bodies.sand.material.friction_angle" = { uniform = [20, 95] }', "must be less than 90; found 95.0"),
+    ('"time.frames" = { integers = [0, 1000] }', "must be at least 1; found 0"),
+    ('"time.frames" = { grid = [9, 8, 7, 6, -5] }', "must be at least 1; found -5"),
+    ('"time.end" = { normal = [1, 0.5] }', "must be greater than 0; found -0.5"),
+    ('"bodies.stone.velocity" = { uniform = [[0, 0, 0], [1, 1, 1]] }',
+     "needs two numbers in this 2D scene (as many as domain.size); found 3"),
+    ('"bodies.stone.shape.ball.center.0" = { choice = [0.7, 0.8, 0.95] }',
+     'with 0.95: bodies[1].shape: body "stone" leaves the domain through x_max by 0.05 m (it reaches x = 1.05, '
+     "the face is at 1); move it or enlarge the domain"),
+])  # fmt: skip
 def test_values_that_make_no_scene_are_found_before_anything_runs(line, sentence):
     key = line.split('"')[1]
     assert refusal(varied(line)) == [f"sweep.toml:6: vary.{key}: {sentence}"]
@@ -296,52 +232,28 @@ def test_two_keys_for_one_value_are_refused():
     ]
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "sentence"),
-    [
-        (
-            'body = "sand"',
-            'body = "snad"',
-            '8: place.body: no body of the base scene has the name "snad"; did you mean "sand"?',
-        ),
-        (
-            'body = "sand"',
-            'body = "water"',
-            '8: place.body: no body of the base scene has the name "water"; the bodies are "sand" and "stone"',
-        ),
-        ('body = "sand"', 'body = "stone"', '10: place.size: "stone" is a ball, which has no size; give radius'),
-        ("size = ", "radius = 0.1 #", '10: place.radius: "sand" is a box, which has no radius; give size'),
-        ("size = ", "size = [0.1] #", "10: place.size: must be two numbers greater than 0; found [0.1]"),
-        ("[[0.15, 0.15]", "[[-0.15, 0.15]", "10: place.size: must be two numbers greater than 0; found [-0.15, 0.15]"),
-        ("[0.3, 0.3]]", "[0.7, 0.3]]", "10: place.size: must fit into the region, 0.6 x 0.6 m; found 0.7 x 0.3 m"),
-        (
-            "integers = [1, 3]",
-            "integers = [0, 3]",
-            "9: place.count: must be whole numbers from 1 to 1000, such as { integers = [1, 3] }; found 0",
-        ),
-        (
-            "integers = [1, 3]",
-            "uniform = [1, 3]",
-            "9: place.count: must be whole numbers from 1 to 1000, such as { integers = [1, 3] }; found 1.0",
-        ),
-        (
-            "min = [0.2, 0.2]",
-            "min = [-0.2, 0.2]",
-            "12: place.region: must lie in the domain; found x = -0.2 to 0.8 of 0 to 1 m",
-        ),
-        (
-            "min = [0.2, 0.2]",
-            "min = [0.9, 0.2]",
-            "12: place.region.max: must be above min along x, so that the region holds bodies",
-        ),
-        ("min_distance = 0.02", "min_distance = -1", "13: place.min_distance: must be at least 0; found -1"),
-        (
-            "[-2.5, -2.5], [2.5, 2.5]",
-            "[-2.5], [2.5]",
-            "11: place.velocity: needs two numbers in this 2D scene (as many as domain.size); found 1",
-        ),
-    ],
-)
+@pytest.mark.parametrize(("old", "new", "sentence"), [
+    ('body = "sand"', 'body = "snad"',
+     '8: place.body: no body of the base scene has the name "snad"; did you mean "sand"?'),
+    ('body = "sand"', 'body = "water"',
+     '8: place.body: no body of the base scene has the name "water"; the bodies are "sand" and "stone"'),
+    ('body = "sand"', 'body = "stone"', '10: place.size: "stone" is a ball, which has no size; give radius'),
+    ("size = ", "radius = 0.1 #", '10: place.radius: "sand" is a box, which has no radius; give size'),
+    ("size = ", "size = [0.1] #", "10: place.size: must be two numbers greater than 0; found [0.1]"),
+    ("[[0.15, 0.15]", "[[-0.15, 0.15]", "10: place.size: must be two numbers greater than 0; found [-0.15, 0.15]"),
+    ("[0.3, 0.3]]", "[0.7, 0.3]]", "10: place.size: must fit into the region, 0.6 x 0.6 m; found 0.7 x 0.3 m"),
+    ("integers = [1, 3]", "integers = [0, 3]",
+     "9: place.count: must be whole numbers from 1 to 1000, such as { integers = [1, 3] }; found 0"),
+    ("integers = [1, 3]", "uniform = [1, 3]",
+     "9: place.count: must be whole numbers from 1 to 1000, such as { integers = [1, 3] }; found 1.0"),
+    ("min = [0.2, 0.2]", "min = [-0.2, 0.2]",
+     "12: place.region: must lie in the domain; found x = -0.2 to 0.8 of 0 to 1 m"),
+    ("min = [0.2, 0.2]", "min = [0.9, 0.2]",
+     "12: place.region.max: must be above min along x, so that the region holds bodies"),
+    ("min_distance = 0.02", "min_distance = -1", "13: place.min_distance: must be at least 0; found -1"),
+    ("[-2.5, -2.5], [2.5, 2.5]", "[-2.5], [2.5]",
+     "11: place.velocity: needs two numbers in this 2D scene (as many as domain.size); found 1"),
+])  # fmt: skip
 def test_a_faulty_placement_is_named(old, new, sentence):
     assert old in SWEEP
     assert f"sweep.toml:{sentence}" in refusal(SWEEP.replace(old, new))

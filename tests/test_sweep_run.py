@@ -682,17 +682,14 @@ def test_a_dataset_goes_on_from_its_own_sweep(of_points: Sweep, monkeypatch: pyt
     assert not settings.directory.exists()
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        'base = "a.toml"\ncount = 5\n[vary]\nx = { uniform = [0, 1] }',
-        'seed = 3\n  base="a.toml" # of old\n[vary]\ncount = { choice = [1, 2] }\nbase = { choice = [1] }',
-        "count = 9\r\nbase = 'a.toml'\r\n",
-        'base = """\na.toml"""\ncount = 3\n',
-        "[vary]\nx = 1\n[split]\ntrain = 1.0",
-        'place = [\n  { template = "a" },\n]\nbase = "a.toml"',
-    ],
-)
+@pytest.mark.parametrize("text", [
+    'base = "a.toml"\ncount = 5\n[vary]\nx = { uniform = [0, 1] }',
+    'seed = 3\n  base="a.toml" # of old\n[vary]\ncount = { choice = [1, 2] }\nbase = { choice = [1] }',
+    "count = 9\r\nbase = 'a.toml'\r\n",
+    'base = """\na.toml"""\ncount = 3\n',
+    "[vary]\nx = 1\n[split]\ntrain = 1.0",
+    'place = [\n  { template = "a" },\n]\nbase = "a.toml"',
+])  # fmt: skip
 def test_a_sweep_that_stands_alone_says_the_same(text: str) -> None:
     data = tomllib.loads(text)
     found = tomllib.loads(standing_alone(SimpleNamespace(text=text, data=data, count=7)))
@@ -708,16 +705,13 @@ def test_parts_without_a_shard_are_not_asked_for(tmp_path: Path) -> None:
     assert open_dataset(tmp_path / "whole").numbers == (0, 1)
 
 
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        ({"split": "other"}, "other draws or another split"),
-        ({"draws": "{}"}, "other draws or another split"),
-        ({"frames": 4}, "other counts"),
-        ({"particles": 1}, "other counts"),
-        ({"checksum": "0" * 8}, "has changed"),
-    ],
-)
+@pytest.mark.parametrize(("change", "said"), [
+    ({"split": "other"}, "other draws or another split"),
+    ({"draws": "{}"}, "other draws or another split"),
+    ({"frames": 4}, "other counts"),
+    ({"particles": 1}, "other counts"),
+    ({"checksum": "0" * 8}, "has changed"),
+])  # fmt: skip
 def test_a_row_that_contradicts_its_trajectory_is_a_fault(truth: Path, change: dict, said: str) -> None:
     manifest = Manifest(truth)
     row = manifest.rows()[3]

@@ -6,17 +6,17 @@ from collections.abc import Callable
 import mpm_reference as reference
 import numpy as np
 import pytest
-from elastic_bodies import DENSITY, LAMBDA, MU, NU, E, H, body_scene, jelly, stirred
+from contact_scenes import DENSITY, LAMBDA, MU, NU, E, jelly
+from elastic_bodies import H, bars, body_scene, stirred
 from law_probe import LawProbe
 from law_tangent import unit_gradients
-from solver_state import scene_of
+from scenes import block, body, scene_of
 
 from mpmcli.errors import InputError
 from mpmcli.materials.law import StateBound
 from mpmcli.materials.registry import laws
 from mpmcli.scene import sample_bodies
 from mpmcli.solver.engine.run import build_run
-from mpmcli.solver.machine.backend import Backend
 
 # Of the domains of free bodies, which share a kernel.
 CELLS = [40, 40]
@@ -34,10 +34,9 @@ def test_a_step_is_that_of_plain_numpy(backend_of: Callable, dimension: int) -> 
     cells = [40, 10] if d == 2 else [8, 6, 5]
     shape = {"box": {"min": [0.0] * d, "max": [0.3, 0.2, 0.2][:d]}}
     scene = scene_of(
+        body("body", jelly(), shape),
         domain={"size": [n * H for n in cells], "cells": cells, "walls": faces, "gravity": gravity},
-        time={"end": 1.0, "frames": 1},
         solver={"solids": "total", "precision": "f64"},
-        bodies=[{"name": "body", "material": jelly(), "shape": shape}],
         forces=[{"acceleration": [f"{pull} * X", *[0.0] * (d - 1)]}],
     )
     run = build_run(scene, backend_of("f64", 1))
@@ -93,17 +92,9 @@ def test_momenta_stay(backend_of: Callable) -> None:
 
     def turned(cells: int) -> float:
         spacing = 0.4 / cells
-        scene = body_scene(
-            [0.6, 0.6],
-            [1.2, 1.0],
-            CELLS,
-            material=jelly(youngs_modulus=1e4),
-            end=0.5,
-            frames=4,
-            spacing=spacing,
-            velocity=[0.3, -0.4],
-            velocity_gradient=[[1.0, 4.0], [-6.0, -2.0]],
-        )
+        spin = {"velocity": [0.3, -0.4], "velocity_gradient": [[1.0, 4.0], [-6.0, -2.0]]}
+        own = block("body", jelly(youngs_modulus=1e4), [0.6, 0.6], [1.2, 1.0], **spin)
+        scene = body_scene(own, CELLS, end=0.5, frames=4, spacing=spacing)
         rows = [row for _, row in build_run(scene, backend_of("f64", 1)).frames()]
         assert max(row.volume_ratio_max for row in rows) > 1.2
         linear = np.array([row.linear_momentum for row in rows])
@@ -120,14 +111,8 @@ def test_no_stencil_changes_as_a_body_flies(backend_of: Callable) -> None:
     """Flight over many cells does not change how a body swings: Galilean invariance to round-off."""
 
     def swing(speed: float) -> np.ndarray:
-        scene = body_scene(
-            [0.2, 0.7],
-            [0.6, 1.1],
-            CELLS,
-            end=0.4,
-            velocity=[speed, 0.0],
-            velocity_gradient=[[1.0, 2.0], [0.5, -1.0]],
-        )
+        own = block("body", jelly(), [0.2, 0.7], [0.6, 1.1], velocity=[speed, 0.0])
+        scene = body_scene(own | {"velocity_gradient": [[1.0, 2.0], [0.5, -1.0]]}, CELLS, end=0.4)
         run = build_run(scene, backend_of("f64", 1))
         for _ in range(100):
             run.step(0.004)
@@ -142,18 +127,11 @@ def test_a_stretched_bar_does_not_tear(backend_of: Callable) -> None:
     """Pulled to three times its length, when its particles stand 1.5 cells apart, its stress is still that of F."""
     pull = 150.0
     scene = scene_of(
+        block("bar", jelly(poissons_ratio=0.0), [0.0, 0.3], [1.0, 0.7], velocity=["4 * X", 0.0]),
         domain={"size": [4.0, 1.0], "spacing": H, "walls": {"x_min": "slip", "x_max": "separate"}},
-        time={"end": 0.25, "frames": 1},
+        end=0.25,
         solver={"solids": "total", "precision": "f64"},
-        output={"fields": ["velocity", "initial_position", "deformation_gradient"]},
-        bodies=[
-            {
-                "name": "bar",
-                "material": jelly(poissons_ratio=0.0),
-                "shape": {"box": {"min": [0.0, 0.3], "max": [1.0, 0.7]}},
-                "velocity": ["4 * X", 0.0],
-            }
-        ],
+        fields=["velocity", "initial_position", "deformation_gradient"],
         forces=[{"acceleration": [f"{pull} * X", 0.0]}],
     )
     frame = list(build_run(scene, backend_of("f64", 1)).frames())[-1][0]
@@ -175,17 +153,9 @@ def test_a_bar_bounces_off_a_wall_after_a_wave_has_gone_there_and_back(backend_o
     h = 1 / n
     c = math.sqrt(E / DENSITY)
     start = gap * h / speed
-    scene = body_scene(
-        [gap * h, 16 * h],
-        [1 + gap * h, 21 * h],
-        CELLS,
-        material=jelly(poissons_ratio=0.0),
-        end=start + 4 / c,
-        frames=400,
-        safety=safety,
-        spacing=h,
-        velocity=[-speed, 0.0],
-    )
+    low, high = [gap * h, 16 * h], [1 + gap * h, 21 * h]
+    own = block("body", jelly(poissons_ratio=0.0), low, high, velocity=[-speed, 0.0])
+    scene = body_scene(own, CELLS, end=start + 4 / c, frames=400, safety=safety, spacing=h)
     rows = [row for _, row in build_run(scene, backend_of("f64", 1)).frames()]
     times = np.array([row.time for row in rows])
     moving = np.array([row.linear_momentum[0] / row.mass / speed for row in rows])
@@ -200,16 +170,9 @@ def test_a_bar_bounces_off_a_wall_after_a_wave_has_gone_there_and_back(backend_o
 @pytest.mark.parametrize("word", ["separate", pytest.param("slip", marks=pytest.mark.slow)])
 def test_a_block_rests_on_a_floor(backend_of: Callable, word: str) -> None:
     """It comes to rest where its weight balances the push: within a hundredth of a cell of the floor."""
-    scene = body_scene(
-        [0.5, 0.21],
-        [1.1, 0.61],
-        CELLS,
-        walls={"y_min": word, "y_max": "separate", "x_min": "separate", "x_max": "separate"},
-        gravity=[0.0, -9.81],
-        material=jelly(youngs_modulus=1e6),
-        end=4.0,
-        frames=4,
-    )
+    walls = {"y_min": word, "y_max": "separate", "x_min": "separate", "x_max": "separate"}
+    own = block("body", jelly(youngs_modulus=1e6), [0.5, 0.21], [1.1, 0.61])
+    scene = body_scene(own, CELLS, walls=walls, gravity=[0.0, -9.81], end=4.0, frames=4)
     frame, row = list(build_run(scene, backend_of("f64", 1)).frames())[-1]
     lowest = frame.position[:, 1].min()
     assert row.kinetic < 1e-3 * row.mass * 9.81 * 0.4
@@ -255,59 +218,42 @@ def test_no_state_is_stiffer_than_its_bound(backend_of: Callable, law: str, dime
     assert (stiffest <= bounds * (1 + 1e-6)).all()
 
 
-def small_run(backend: Backend) -> tuple[np.ndarray, list]:
-    """Return the last positions, and the ledger, of a body that falls on a floor, turning."""
-    scene = body_scene(
-        [0.4, 0.2],
-        [0.9, 0.6],
-        [16, 10],
-        gravity=[0.5, -9.81],
-        end=0.3,
-        frames=3,
-        precision=backend.precision,
-        velocity_gradient=[[0.0, 2.0], [-2.0, 0.0]],
-    )
-    found = list(build_run(scene, backend).frames())
-    return found[-1][0].position, [row for _, row in found]
-
-
 @pytest.mark.slow
-def test_threads_change_no_byte(backend_of: Callable) -> None:
-    expected, rows = small_run(backend_of("f32", 1))
-    found, own = small_run(backend_of("f32", 3))
-    assert found.tobytes() == expected.tobytes()
-    assert own == rows
+@pytest.mark.parametrize("asked", ["a body that falls on a floor, turning", "two bars that meet"])
+def test_threads_change_no_byte(backend_of: Callable, asked: str) -> None:
+    """Of the last positions and of the ledger."""
+    own = block("body", jelly(), [0.4, 0.2], [0.9, 0.6], velocity_gradient=[[0.0, 2.0], [-2.0, 0.0]])
+    scene = body_scene(own, [16, 10], gravity=[0.5, -9.81], end=0.3, frames=3, precision="f32")
+    scene = bars(16, 0.25, precision="f32", frames=5) if asked == "two bars that meet" else scene
+    one, several = (list(build_run(scene, backend_of("f32", threads)).frames()) for threads in (1, 3))
+    assert one[-1][0].position.tobytes() == several[-1][0].position.tobytes()
+    assert [row for _, row in one] == [row for _, row in several]
 
 
-@pytest.mark.parametrize(
-    ("changes", "said"),
-    [
-        ({"bodies": [("body", jelly()), ("other", jelly())]}, "it must be 0.3 m"),
-        (
-            {"bodies": [("body", jelly()), ("other", jelly(law="fixed_corotated"))]},
-            "is for bodies of one law; found fixed_corotated and neo_hookean",
-        ),
-        ({"bodies": [("body", {"law": "fluid", "density": 1e3, "bulk_modulus": 1e4})]}, "follows fluid"),
-        ({"deformation": [[1.1, 0.0], [0.0, 1.0]]}, "must be left out with solver.solids"),
-        ({"low": 0.05}, "begins 0.05 m from the wall y_min, which does not separate"),
-        ({"low": 0.3, "word": "stick"}, '"body" begins 0.3 m away, and would not stick to it later'),
-    ],
-)
+@pytest.mark.parametrize(("changes", "said"), [
+    ({"bodies": [("body", jelly()), ("other", jelly())]}, "it must be 0.3 m"),
+    ({"bodies": [("body", jelly()), ("other", jelly(law="fixed_corotated"))]},
+     "is for bodies of one law; found fixed_corotated and neo_hookean"),
+    ({"bodies": [("body", {"law": "fluid", "density": 1e3, "bulk_modulus": 1e4})]}, "follows fluid"),
+    ({"deformation": [[1.1, 0.0], [0.0, 1.0]]}, "must be left out with solver.solids"),
+    ({"low": 0.05}, "begins 0.05 m from the wall y_min, which does not separate"),
+    ({"low": 0.3, "word": "stick"}, '"body" begins 0.3 m away, and would not stick to it later'),
+])  # fmt: skip
 def test_what_cannot_be_on_that_grid_is_refused(changes: dict, said: str) -> None:
     low = changes.get("low", 0.0)
     bodies = [
-        {
-            "name": name,
-            "material": material,
-            "shape": {"box": {"min": [0.3 + 0.6 * k, low], "max": [0.7 + 0.6 * k, low + 0.4]}},
-            **({"deformation": changes["deformation"]} if "deformation" in changes else {}),
-        }
+        block(
+            name,
+            material,
+            [0.3 + 0.6 * k, low],
+            [0.7 + 0.6 * k, low + 0.4],
+            **{"deformation": changes["deformation"]} if "deformation" in changes else {},
+        )
         for k, (name, material) in enumerate(changes.get("bodies", [("body", jelly())]))
     ]
     with pytest.raises(InputError, match=said):
         scene_of(
+            *bodies,
             domain={"size": [2.0, 1.0], "spacing": H, "walls": {"y_min": changes.get("word", "slip")}},
-            time={"end": 1.0, "frames": 1},
             solver={"solids": "total", "walls": changes.get("walls", "folded")},
-            bodies=bodies,
         )

@@ -5,10 +5,11 @@ from itertools import product
 
 import numpy as np
 import pytest
+import scenes
+from scenes import ball, box, polygon
 
 from mpmcli.errors import InputError
-from mpmcli.materials.registry import parameter_models
-from mpmcli.scene import checks, estimate_particles, parse_scene, sample_bodies
+from mpmcli.scene import checks, estimate_particles, sample_bodies
 from mpmcli.scene.sampling import turned_axes, turned_points
 
 H = 0.02
@@ -18,13 +19,9 @@ CELLS = {2: (14, 12), 3: (8, 7, 9)}
 
 def scene_of(d, shape=None, shift=0.0, walls="separate", length=20, **body):
     low, high = np.full(d, shift * H), (np.array(CELLS[d]) + shift) * H
-    data = {
-        "domain": {"size": [length * H, *[14 * H] * (d - 1)], "spacing": H, "walls": walls},
-        "time": {"end": 1.0, "frames": 1},
-        "bodies": [{"name": "b", "material": "water", "shape": shape or {"box": {"min": [*low], "max": [*high]}}}],
-    }
-    data["bodies"][0] |= body
-    return parse_scene(data, laws=parameter_models()).scene
+    domain = {"size": [length * H, *[14 * H] * (d - 1)], "spacing": H, "walls": walls}
+    own = {"name": "b", "material": "water", "shape": shape or box(low, high)} | body
+    return scenes.scene_of(own, domain=domain, contact={})
 
 
 def deviations(scene, low, high, images):
@@ -101,7 +98,7 @@ def test_turned_points_are_all_those_in_the_box(d):
 @pytest.mark.parametrize("high", [[0.28, 0.24], [0.11, 0.11], [0.28, 0.001], [0.25, 0.26, 0.1], [0.3, 0.004, 0.002]])
 def test_a_turned_box_has_the_count_of_a_lattice(high):
     """Thin ones too, whose particles lie all along them."""
-    shape = {"box": {"min": [0.0] * len(high), "max": high}}
+    shape = box([0.0] * len(high), high)
     scene = scene_of(len(high), shape, sampling="turned")
     (turned,), (lattice,) = sample_bodies(scene), sample_bodies(scene_of(len(high), shape))
     assert turned.count == lattice.count == estimate_particles(scene)
@@ -111,15 +108,12 @@ def test_a_turned_box_has_the_count_of_a_lattice(high):
     assert counts.max() - counts.min() <= max(2, 0.1 * turned.count)
 
 
-RING = {
-    "ball": {"center": [0.14, 0.14], "radius": 0.13},
-    "subtract": [{"ball": {"center": [0.14, 0.14], "radius": 0.05}}],
-}
+RING = {"ball": {"center": [0.14, 0.14], "radius": 0.13}, "subtract": [ball([0.14, 0.14], 0.05)]}
 SHAPES = {
-    "ball": (2, {"ball": {"center": [0.14, 0.14], "radius": 0.13}}),
-    "ball on the floor": (3, {"ball": {"center": [0.14, 0.14, 0.1], "radius": 0.1}}),
+    "ball": (2, ball([0.14, 0.14], 0.13)),
+    "ball on the floor": (3, ball([0.14, 0.14, 0.1], 0.1)),
     "ring": (2, RING),
-    "polygon": (2, {"polygon": {"vertices": [[0.0, 0.0], [0.3, 0.0], [0.05, 0.2]]}}),
+    "polygon": (2, polygon([[0.0, 0.0], [0.3, 0.0], [0.05, 0.2]])),
 }
 
 

@@ -26,21 +26,18 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(type(all_cases()[BAR]), "levels", {"coarse": (13,)})
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["bar_fixed_fre"], 'there is no case "bar_fixed_fre"; did you mean "bar_fixed_free"?'),
-        (["zzz"], 'there is no case "zzz"; there are '),
-        ([BAR, "--resume"], "name its directory with -o"),
-        ([BAR, "--resume", "--overwrite", "-o", "x"], "give one of them"),
-        ([BAR, "--resolution", "9"], "--resolution is for --write-scene"),
-        (["--write-scene"], "prints the scene of one case; name it"),
-        ([BAR, "--list", "--write-scene"], "give one of them"),
-        ([BAR, "--levels", "finest"], "'finest' is not one of 'coarse', 'default', 'fine'"),
-        ([BAR, "--workers", "0"], "0 is not in the range x>=1"),
-        ([BAR, "-o", "."], "exists and is not empty: give another directory"),
-    ],
-)
+@pytest.mark.parametrize(("words", "said"), [
+    (["bar_fixed_fre"], 'there is no case "bar_fixed_fre"; did you mean "bar_fixed_free"?'),
+    (["zzz"], 'there is no case "zzz"; there are '),
+    ([BAR, "--resume"], "name its directory with -o"),
+    ([BAR, "--resume", "--overwrite", "-o", "x"], "give one of them"),
+    ([BAR, "--resolution", "9"], "--resolution is for --write-scene"),
+    (["--write-scene"], "prints the scene of one case; name it"),
+    ([BAR, "--list", "--write-scene"], "give one of them"),
+    ([BAR, "--levels", "finest"], "'finest' is not one of 'coarse', 'default', 'fine'"),
+    ([BAR, "--workers", "0"], "0 is not in the range x>=1"),
+    ([BAR, "-o", "."], "exists and is not empty: give another directory"),
+])  # fmt: skip
 def test_bad_usage_is_told_before_anything_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], said: str
 ) -> None:

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import mpm_reference as reference
 import numpy as np
 import pytest
-from solver_state import scene_of
+from scenes import scene_of
 
 from mpmcli.solver.engine.run import build_run
 from mpmcli.validation.case import Setting

@@ -22,13 +22,9 @@ ELASTICA = [
 ]
 # Law, E, height at rest of a column of 50 m (docs/theory.md, 10).
 SETTLED = [
-    ("von_mises", 1e6, 49.03799142),
-    ("neo_hookean", 1e6, 49.01333014),
-    ("fixed_corotated", 1e6, 49.0),
-    ("von_mises", 1e5, 42.66526084),
-    ("neo_hookean", 1e5, 41.30303152),
-    ("fixed_corotated", 1e5, 40.0),
-]
+    ("von_mises", 1e6, 49.03799142), ("neo_hookean", 1e6, 49.01333014), ("fixed_corotated", 1e6, 49.0),
+    ("von_mises", 1e5, 42.66526084), ("neo_hookean", 1e5, 41.30303152), ("fixed_corotated", 1e5, 40.0),
+]  # fmt: skip
 # Elements along the membrane, the part that is pulled not included, and across.
 ELEMENTS = 18, 10
 # Points and weights of Gauss on [-1, 1].

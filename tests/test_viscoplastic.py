@@ -308,13 +308,8 @@ def test_pressure_of_mud_at_rest_is_its_weight(tmp_path: Path, changed: tuple[st
 
 
 LUMP = """
-[domain]
-size = [0.5, 0.5, 0.2]
-spacing = 0.02
-gravity = [0.0, 0.0, -9.81]
-[time]
-end = 0.33
-frames = 1
+domain = { size = [0.5, 0.5, 0.2], spacing = 0.02, gravity = [0.0, 0.0, -9.81] }
+time = { end = 0.33, frames = 1 }
 [[bodies]]
 name = "lump"
 material = "mud"

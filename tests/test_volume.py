@@ -5,17 +5,17 @@ from itertools import product
 
 import numpy as np
 import pytest
-from scenes import block, scene, volume_errors
+import scenes
+from scenes import block, scene, slow, volume_errors
 from scipy.stats import norm
 
 from mpmcli.materials.fluid import BESIDE, DEAD_BAND, FREE_DEAD_BAND, FULL, LARGEST_LACK, OPENED, RELAXATION, Fluid
-from mpmcli.materials.registry import parameter_models
 from mpmcli.materials.sand import BAND, Sand
 from mpmcli.materials.sand import RELAXATION as GRAINS_RELAXATION
-from mpmcli.scene import Scene, parse_scene, sample_bodies
+from mpmcli.scene import Scene, sample_bodies
 from mpmcli.solver.engine import kernel_store
 from mpmcli.solver.engine.plan import make_plan
-from mpmcli.solver.engine.run import build_run
+from mpmcli.solver.engine.run import Run, build_run
 from mpmcli.solver.transfer.splines import PAD
 from mpmcli.stability.transfer_factors import INTERVAL
 from mpmcli.validation.case import Setting
@@ -147,12 +147,28 @@ def test_openings_are_remembered(backend_of: Callable) -> None:
         assert (np.abs(grown(before, C, dt) - free)[body == 0] > 1e-5).any() == (sign < 0)
 
 
+# For how long nothing was relaxed before the step of `stepped`, s.
+UNRELAXED = 2e-3
+
+
+def stepped(run: Run, dt: float) -> tuple[dict, dict, dict]:
+    """Return a law's particles, and those after a step that relaxes volumes, and after one that does not."""
+    saved, found = run.save().copied(), [run.groups[0].read()]
+    for steps in (INTERVAL - 1, 0):
+        run.load(saved)
+        run.state.unrelaxed_steps = steps
+        run.state.unrelaxed = UNRELAXED
+        run.step(dt)
+        found.append(run.groups[0].read())
+    return tuple(found)
+
+
 @pytest.mark.parametrize(
     ("densities", "walls", "d"),
     [
-        pytest.param((1000.0,), "slip", 2, marks=pytest.mark.slow, id="one density"),
+        slow((1000.0,), "slip", 2, id="one density"),
         pytest.param((1000.0, 400.0), {"default": "stick", "x_max": "slip"}, 2, id="two densities"),
-        pytest.param((1000.0,), "slip", 3, marks=pytest.mark.slow, id="3D"),
+        slow((1000.0,), "slip", 3, id="3D"),
     ],
 )
 def test_volume_follows_the_grid(
@@ -175,19 +191,10 @@ def test_volume_follows_the_grid(
     group.replace(x=group.read()["x"] * [1.0, 0.85, 1.0][:d], deformation=random.uniform(0.7, 1.2, group.count))
     run.state_was_replaced()
     run.step(1e-4)
-    saved = run.save().copied()
-    before = group.read()
-    found = []
-    for steps in (INTERVAL - 1, 0):
-        run.load(saved)
-        run.state.unrelaxed_steps = steps
-        run.state.unrelaxed = time = 2e-3
-        run.step(1e-4)
-        found.append(group.read())
-    relaxed, plain = found
+    before, relaxed, plain = stepped(run, 1e-4)
     volume = np.array([b.volume for b in sample_bodies(run.scene)])[before["body"]]
     seen, least, beside = seen_ratio(before["x"], volume, run.scene.domain.cells)
-    crossings = np.sqrt(BULK / np.array(densities))[before["body"]] * (time + 1e-4) / H
+    crossings = np.sqrt(BULK / np.array(densities))[before["body"]] * (UNRELAXED + 1e-4) / H
     J = before["deformation"]
     moves = (least > FULL) & ((seen < J) | (beside * seen > BESIDE))
     gap = (seen - J) * moves
@@ -221,14 +228,8 @@ def test_sand_follows_the_grid(backend_of: Callable, monkeypatch: pytest.MonkeyP
     monkeypatch.setenv(kernel_store.SWITCH, "off")
     sand = {"law": "sand", "density": 1600.0, "youngs_modulus": 1e6, "friction_angle": 30.0, "poissons_ratio": 0.3}
     bodies = [
-        block(
-            f"sand {k}",
-            {**sand, "volume_correction": k == 0},
-            [0.6 * k, 0.0],
-            [0.6 * (k + 1), 0.5],
-            sampling="jittered",
-        )
-        for k in (0, 1)
+        block(f"sand {k}", law, [0.6 * k, 0.0], [0.6 * (k + 1), 0.5], sampling="jittered")
+        for k, law in enumerate(sand | {"volume_correction": corrected} for corrected in (True, False))
     ]
     run = build_run(unshifted(scene([12, 8], H, bodies, 1.0, walls="slip", precision="f64")), backend_of("f64"))
     (group,) = run.groups
@@ -243,16 +244,7 @@ def test_sand_follows_the_grid(backend_of: Callable, monkeypatch: pytest.MonkeyP
     group.replace(deformation=np.exp(strain / 2)[:, None, None] * np.eye(2), internal=np.stack([opened, 0 * opened], 1))
     # What is at rest stays as it is.
     group.replace(v=np.zeros((group.count, 2)), C=random.normal(size=(group.count, 2, 2)))
-    saved = run.save().copied()
-    before = group.read()
-    found = []
-    for steps in (INTERVAL - 1, 0):
-        run.load(saved)
-        run.state.unrelaxed_steps = steps
-        run.state.unrelaxed = time = 2e-3
-        run.step(1e-5)
-        found.append(group.read())
-    relaxed, plain = found
+    before, relaxed, plain = stepped(run, 1e-5)
     x, body = before["x"], before["body"]
     volume = np.array([b.volume for b in sample_bodies(run.scene)])[body]
     filled, slope = filling(x, volume, run.scene.domain.cells)
@@ -261,7 +253,7 @@ def test_sand_follows_the_grid(backend_of: Callable, monkeypatch: pytest.MonkeyP
     narrow = 1 / 2 - 1 / 30
     z = np.sqrt(-4 * narrow * np.log(np.clip(slope * np.sqrt(2 * np.pi * narrow), 1e-6, 1)))
     below = np.log(norm.cdf(z))
-    crossings = np.sqrt(sound_modulus(1e6, 0.3) / 1600.0) * (time + 1e-5) / H
+    crossings = np.sqrt(sound_modulus(1e6, 0.3) / 1600.0) * (UNRELAXED + 1e-5) / H
     share = np.where(strain < 0, GRAINS_RELAXATION * crossings / (1 + GRAINS_RELAXATION * crossings), 1.0)
     opening = np.maximum(np.minimum(gap, np.log(seen)) + below, 0) * share
     closing = np.minimum(gap + BAND, 0)
@@ -302,17 +294,12 @@ def test_nodes_keep_volume_only_where_densities_differ(backend_of: Callable) -> 
 
 def uncorrected(tables: dict) -> Scene:
     bodies = [{**body, "material": {**body["material"], "volume_correction": False}} for body in tables["bodies"]]
-    return parse_scene({**tables, "bodies": bodies}, laws=parameter_models()).scene
+    return scenes.scene_of(**{"contact": {}} | tables | {"bodies": bodies})
 
 
 @pytest.mark.parametrize(
     ("name", "least"),
-    [
-        pytest.param("toss", 0.3, marks=pytest.mark.slow),
-        pytest.param("sand_toss", 0.3, marks=pytest.mark.slow),
-        pytest.param("dam_at_rest", 0.05, marks=pytest.mark.slow),
-        pytest.param("stirred_pool", 0.05, marks=pytest.mark.slow),
-    ],
+    [slow("toss", 0.3), slow("sand_toss", 0.3), slow("dam_at_rest", 0.05), slow("stirred_pool", 0.05)],
 )
 def test_a_case_of_volume_fails_without_the_correction(
     backend_of: Callable, record_property: Callable, name: str, least: float

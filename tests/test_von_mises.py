@@ -14,11 +14,7 @@ from mpmcli.scene.material import SceneBounds
 
 BOTH = pytest.mark.parametrize("dimension", [2, 3])
 MODULUS, YIELD, HARDENING = 7e7, 2e5, 4e6
-KINDS = {
-    "hardening": {"hardening_modulus": HARDENING},
-    "perfect": {},
-    "elastic": {"yield_stress": 1e12},
-}
+KINDS = {"hardening": {"hardening_modulus": HARDENING}, "perfect": {}, "elastic": {"yield_stress": 1e12}}
 
 
 def metal(kind: str) -> VonMisesParameters:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from conftest import ROOT
 from contact_scenes import DENSITY, E, G, H, body, jelly, scene
+from scenes import slow
 
 from mpmcli.check.collider_work import work_of_colliders
 from mpmcli.check.result_check import HELD_ENERGY, check_kept, energy_change
@@ -59,9 +60,7 @@ def falling(way: str, shift: float, n: int, speed: float = 2e-3, **tables: objec
     return scene([bar], end=gap / pace + 3 * n * H / C, frames=200, **asked, **tables)
 
 
-@pytest.mark.parametrize(
-    ("way", "shift"), [("wall", 0.3), pytest.param("wall", 0.0, marks=pytest.mark.slow), ("plane", 0.3)]
-)
+@pytest.mark.parametrize(("way", "shift"), [("wall", 0.3), slow("wall", 0.0), ("plane", 0.3)])
 def test_a_bar_meets_a_wall_where_it_is(backend_of: Callable, way: str, shift: float) -> None:
     """It touches within 0.03 cells, stays for 2 L / c, and leaves with nearly the speed that it came with."""
     n, pace = 16, 2e-3 * C
@@ -75,7 +74,7 @@ def test_a_bar_meets_a_wall_where_it_is(backend_of: Callable, way: str, shift: f
     assert 0.93 < moves[-1] < 1.0
 
 
-@pytest.mark.parametrize("way", ["wall", pytest.param("plane", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("way", ["wall", slow("plane")])
 def test_nothing_passes_at_the_speed_of_waves(backend_of: Callable, way: str) -> None:
     """What is too fast for the spring of contact is stopped less than a cell behind; no energy is made."""
     asked = falling(way, 0.3, 16, 1.0)
@@ -87,7 +86,7 @@ def test_nothing_passes_at_the_speed_of_waves(backend_of: Callable, way: str) ->
     assert energy.max() <= energy[0] * (1 + 1e-6)
 
 
-@pytest.mark.parametrize("way", ["wall", pytest.param("plane", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("way", ["wall", slow("plane")])
 def test_what_shows_no_surface_is_stopped(backend_of: Callable, way: str) -> None:
     """As what was torn or crushed, it is stopped within a cell, and flies back."""
     run = build_run(falling(way, 0.3, 8, 0.1), backend_of("f64", 1))
@@ -123,7 +122,7 @@ def turned_block(way: str, degrees: float, friction: float, shift: float, time: 
     [
         ("wall", 0.0, 0.3, 3e-3),
         *(
-            pytest.param(*how, marks=pytest.mark.slow)
+            slow(*how)
             for how in (
                 ("wall", 0.0, 0.0, 1e-3),
                 ("plane", 0.0, 0.3, 3e-3),
@@ -171,7 +170,7 @@ def test_a_disc_rolls_or_slides_down_a_wall(backend_of: Callable, friction: floa
         assert -turning * r * H / (2 * G * math.cos(slope)) == pytest.approx(0.05, rel=0.08)
 
 
-@pytest.mark.parametrize("way", [pytest.param("wall", marks=pytest.mark.slow), "box"])
+@pytest.mark.parametrize("way", [slow("wall"), "box"])
 def test_a_belt_carries_a_block(backend_of: Callable, way: str) -> None:
     """It slides with mu g until it has the velocity of the belt, and keeps that."""
     friction, pace = 0.4, 0.8
@@ -288,22 +287,15 @@ def worked(asked: Scene, backend: object) -> tuple[np.ndarray, np.ndarray, list]
     return (energy - energy[0]) / turned, np.cumsum([row.contact_work for row in rows]) / turned, rows
 
 
-@pytest.mark.parametrize(
-    "how",
-    [
-        ("post", 0.5, E, 0.0),
-        ("post", 0.0, 30 * E, 0.3),
-        ("wedge", 0.0, 30 * E, 0.0),
-        ("ball", 0.5, 30 * E, 0.3),
-        ("edge", 0.5, E, 0.3),
-        ("corner", 0.5, E, 0.3),
-        pytest.param(("corner", 0.0, 30 * E, 0.0), marks=pytest.mark.slow),
-        pytest.param(("post", 0.5, E, 0.3, 2), marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.parametrize("how", [
+    ("post", 0.5, E, 0.0), ("post", 0.0, 30 * E, 0.3), ("wedge", 0.0, 30 * E, 0.0), ("ball", 0.5, 30 * E, 0.3),
+    ("edge", 0.5, E, 0.3), ("corner", 0.5, E, 0.3), slow(("corner", 0.0, 30 * E, 0.0)),
+    slow(("post", 0.5, E, 0.3, 2)), slow(("3D",)),
+])  # fmt: skip
 def test_an_obstacle_makes_no_energy(backend_of: Callable, how: tuple) -> None:
     """Neither does contact give more than it has taken, at any time."""
-    kept, contact, _ = worked(on_an_edge(*how), backend_of("f64", 1))
+    asked = on_a_post_in_3d() if how == ("3D",) else on_an_edge(*how)
+    kept, contact, _ = worked(asked, backend_of("f64", 1))
     assert kept.max() < 1e-6 and contact.max() < 1e-6
     assert kept.min() < -1e-2 and contact.min() < -1e-3
 
@@ -313,8 +305,8 @@ def test_an_obstacle_makes_no_energy(backend_of: Callable, how: tuple) -> None:
     [
         ("jaws", 0.5, E, 0.3),
         ("gripper", 1.0, 5 * E, 0.3),
-        pytest.param(("jaws", 0.0, 10 * E, 0.0), marks=pytest.mark.slow),
-        pytest.param(("jaws", 0.5, E, 0.3, 2), marks=pytest.mark.slow),
+        slow(("jaws", 0.0, 10 * E, 0.0)),
+        slow(("jaws", 0.5, E, 0.3, 2)),
     ],
 )
 def test_jaws_give_no_more_energy_than_their_work(backend_of: Callable, how: tuple) -> None:
@@ -329,13 +321,6 @@ def test_jaws_give_no_more_energy_than_their_work(backend_of: Callable, how: tup
     else:
         assert rows[-1].kinetic < 0.1 * max(row.kinetic for row in rows)
         assert kept[-1] > -0.15
-
-
-@pytest.mark.slow
-def test_an_obstacle_makes_no_energy_in_3d(backend_of: Callable) -> None:
-    kept, contact, _ = worked(on_a_post_in_3d(), backend_of("f64", 1))
-    assert kept.max() < 1e-6 and contact.max() < 1e-6
-    assert kept.min() < -1e-2 and contact.min() < -1e-3
 
 
 @pytest.mark.slow
@@ -396,7 +381,7 @@ def test_the_ledger_lacks_a_part_of_the_energy_of_contact(backend_of: Callable) 
     assert work.min() < 0.0 and work.max() < 1e-3 * np.ptp(parts[2])
 
 
-@pytest.mark.parametrize("way", ["wall", pytest.param("plane", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("way", ["wall", slow("plane")])
 def test_jelly_rests_on_the_floor(backend_of: Callable, way: str) -> None:
     """Its lowest row is as far above it as when surfaces touch, 0.03 cells off; 0.15 at its corners.
 

@@ -4,7 +4,8 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from solver_state import BodyState, bodies_of, scene_of
+from scenes import block, scene_of, slow
+from solver_state import BodyState, bodies_of
 
 from mpmcli.scene import BodyParticles, Scene
 from mpmcli.solver.engine.run import build_run
@@ -26,10 +27,9 @@ def thrown(friction: object, faces: object, dimension: int, **solver: object) ->
     """Return a block in the middle of a floor, with room around it, in f64 and without gravity."""
     low, high = [0.8, 0.0, 0.8][:dimension], [1.2, 0.35, 1.2][:dimension]
     return scene_of(
+        block("block", JELLY, low, high),
         domain={"size": [2.0] * dimension, "spacing": 0.1, "walls": faces, "friction": friction},
-        time={"end": 1.0, "frames": 1},
         solver={"precision": "f64", **solver},
-        bodies=[{"name": "block", "material": JELLY, "shape": {"box": {"min": low, "max": high}}}],
     )
 
 
@@ -57,8 +57,8 @@ def stepped(backend: object, scene: Scene, velocity: list[float], shear: float =
     [
         (2, "slip", {}),
         (2, "separate", {"transfer": "aflip"}),
-        pytest.param(2, "separate", {"kernel": "cubic"}, marks=pytest.mark.slow),
-        pytest.param(3, "separate", {}, marks=pytest.mark.slow),
+        slow(2, "separate", {"kernel": "cubic"}),
+        slow(3, "separate", {}),
     ],
 )
 def test_a_sliding_body_loses_friction_times_push(
@@ -132,26 +132,18 @@ def block_on_floor(
     theta, h = np.radians(degrees), HEIGHT / cells
     pull = [G * np.sin(theta), -G * np.cos(theta)]
     slowly = " + 0*t" if speed else "*(0.5 - 0.5*cos(pi*min(t/0.4, 1)))"
+    material = JELLY | ({"poissons_ratio": 0.0} if speed else {})
     weight = {"deformation": [[1, 0], [0, f"1 - {DENSITY * G / 1e6} * ({HEIGHT} - Y)"]]}
     return scene_of(
-        domain={
-            "size": [4 * LENGTH, 8 * h],
-            "spacing": h,
-            "gravity": [f"{a}{slowly}" for a in pull],
-            "walls": walls,
-            "friction": {"y_min": friction},
-        },
-        time={"end": end, "frames": 1},
+        block("block", material, [0.5, 0.0], [0.5 + LENGTH, HEIGHT], velocity=[speed, 0.0])
+        | (weight if speed and solver.get("solids") != "total" else {}),
+        size=[4 * LENGTH, 8 * h],
+        spacing=h,
+        gravity=[f"{a}{slowly}" for a in pull],
+        walls=walls,
+        friction={"y_min": friction},
+        end=end,
         solver={"precision": "f64", **solver},
-        bodies=[
-            {
-                "name": "block",
-                "material": JELLY | ({"poissons_ratio": 0.0} if speed else {}),
-                "shape": {"box": {"min": [0.5, 0.0], "max": [0.5 + LENGTH, HEIGHT]}},
-                "velocity": [speed, 0.0],
-                **(weight if speed and solver.get("solids") != "total" else {}),
-            }
-        ],
     )
 
 
@@ -165,16 +157,13 @@ def history(backend: object, scene: Scene) -> np.ndarray:
     return np.array(found).T
 
 
-@pytest.mark.parametrize(
-    ("walls", "degrees", "friction", "solids"),
-    [
-        ("separate", 30.0, 0.3, "updated"),
-        pytest.param("separate", 20.0, 0.2, "updated", marks=pytest.mark.slow),
-        pytest.param("slip", 30.0, 0.1, "updated", marks=pytest.mark.slow),
-        ("separate", 30.0, 0.3, "total"),
-        pytest.param("slip", 30.0, 0.1, "total", marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.parametrize(("walls", "degrees", "friction", "solids"), [
+    ("separate", 30.0, 0.3, "updated"),
+    slow("separate", 20.0, 0.2, "updated"),
+    slow("slip", 30.0, 0.1, "updated"),
+    ("separate", 30.0, 0.3, "total"),
+    slow("slip", 30.0, 0.1, "total"),
+])  # fmt: skip
 def test_a_block_slides_down_an_incline(
     backend_of: Callable, walls: str, degrees: float, friction: float, solids: str, record_property: Callable
 ) -> None:
@@ -191,10 +180,7 @@ def test_a_block_slides_down_an_incline(
     assert found == pytest.approx(expected, rel=0.01)
 
 
-@pytest.mark.parametrize(
-    ("walls", "solids"),
-    [pytest.param("slip", "updated", marks=pytest.mark.slow), ("separate", "updated"), ("separate", "total")],
-)
+@pytest.mark.parametrize(("walls", "solids"), [slow("slip", "updated"), ("separate", "updated"), ("separate", "total")])
 def test_a_block_stays_on_an_incline(backend_of: Callable, walls: str, solids: str, record_property: Callable) -> None:
     """mu >= tan(theta): it drifts by less than 1e-4 of its length in a second, and by nothing but its vibration."""
     degrees = 30.0
@@ -206,9 +192,7 @@ def test_a_block_stays_on_an_incline(backend_of: Callable, walls: str, solids: s
     assert abs(drift) < 1e-4 * LENGTH
 
 
-@pytest.mark.parametrize(
-    "settings", [{}, pytest.param({"transfer": "aflip"}, marks=pytest.mark.slow)], ids=["apic", "aflip"]
-)
+@pytest.mark.parametrize("settings", [{}, slow({"transfer": "aflip"})], ids=["apic", "aflip"])
 def test_a_block_comes_to_rest(backend_of: Callable, settings: dict, record_property: Callable) -> None:
     """A block thrown along a floor stops after v^2 / (2 mu g), to 1 %, and stays."""
     speed, friction = 2.0, 0.3
@@ -261,7 +245,7 @@ def test_slip_is_saved(backend_of: Callable) -> None:
     assert np.abs(run.groups[0].arrays.slip.to_numpy()).max() > 0
 
 
-@pytest.mark.parametrize("parts", [1, 5, pytest.param(50, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("parts", [1, 5, slow(50)])
 def test_a_sliding_block_slows_down_as_fast_at_any_step(backend_of: Callable, parts: int) -> None:
     """At steps of 1, 1/5 and 1/50 its speed falls by mu (g t + v_y); with nu = 0 sliding excites no waves."""
     speed, friction = 2.0, 0.3

@@ -10,7 +10,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from solver_state import BodyState, bodies_of, scene_of
+from scenes import ball, block, body, scene_of, slow
+from solver_state import BodyState, bodies_of
 
 from mpmcli.scene import BodyParticles, Scene, sample_bodies
 from mpmcli.solver.engine.run import build_run
@@ -27,14 +28,7 @@ def two_bodies(dimension: int, cells: int, walls: object) -> Scene:
     """Return a scene with the bodies of `BODIES`, whose particles tests put where they want."""
     d = dimension
     low, high = [0.3] * d, [0.5] * d
-    bodies = [
-        {"name": "solid", "material": SOLID, "shape": {"box": {"min": low, "max": high}}},
-        {
-            "name": "liquid",
-            "material": LIQUID,
-            "shape": {"box": {"min": [0.7, *low[1:]], "max": [0.9, *high[1:]]}},
-        },
-    ]
+    bodies = [block("solid", SOLID, low, high), block("liquid", LIQUID, [0.7, *low[1:]], [0.9, *high[1:]])]
     return scene_of(
         domain={"size": [cells * H] * d, "spacing": H, "walls": walls},
         time={"end": 1.0, "frames": 1},
@@ -83,7 +77,7 @@ def run(
     return bodies_of(run)
 
 
-@pytest.mark.parametrize("dimension", [2, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("dimension", [2, slow(3)])
 def test_a_slip_corner_is_its_mirror_image(backend_of: Callable, dimension: int, record_property: Callable) -> None:
     """A body in each corner of a box moves as its part of 2^d mirrored bodies around a point, to 1e-10.
 
@@ -95,22 +89,10 @@ def test_a_slip_corner_is_its_mirror_image(backend_of: Callable, dimension: int,
     steps, dt = 120, 0.004
     size = 16 * H
     corners = [[0.0 if s > 0 else size for s in sign] for sign in signs]
-    boxed = run(
-        backend_of,
-        two_bodies(d, 16, "slip"),
-        [mirrored(body, corners, signs) for body in base],
-        steps,
-        dt,
-    )
+    boxed = run(backend_of, two_bodies(d, 16, "slip"), [mirrored(body, corners, signs) for body in base], steps, dt)
     far = 24 if d == 3 else 32
     centre = [[far * H / 2] * d] * len(signs)
-    free = run(
-        backend_of,
-        two_bodies(d, far, "separate"),
-        [mirrored(body, centre, signs) for body in base],
-        steps,
-        dt,
-    )
+    free = run(backend_of, two_bodies(d, far, "separate"), [mirrored(body, centre, signs) for body in base], steps, dt)
     largest = 0.0
     for name in BODIES[d]:
         n = len(base[0].position)
@@ -150,13 +132,7 @@ def test_a_slip_wall_mirrors_a_separating_floor_too(backend_of: Callable, seed: 
     half = run(backend_of, two_bodies(2, 16, {"default": "separate", "x_min": "slip"}), base, steps, dt)
     centre = [[1.6, 0.0]] * 2
     signs = [(1.0, 1.0), (-1.0, 1.0)]
-    whole = run(
-        backend_of,
-        two_bodies(2, 32, "separate"),
-        [mirrored(body, centre, signs) for body in base],
-        steps,
-        dt,
-    )
+    whole = run(backend_of, two_bodies(2, 32, "separate"), [mirrored(body, centre, signs) for body in base], steps, dt)
     n = len(base[0].position)
     largest = max(float(np.abs(half[name].v - whole[name].v[:n]).max()) for name in BODIES[2])
     record_property("largest difference", largest)
@@ -166,17 +142,9 @@ def test_a_slip_wall_mirrors_a_separating_floor_too(backend_of: Callable, seed: 
 def block_scene(walls: object, gravity: Sequence[float], **body: object) -> Scene:
     """Return a scene with an elastic block of 4 x 3 cells on the floor."""
     return scene_of(
+        block("block", SOLID, [0.6, 0.0], [1.0, 0.3], **body),
         domain={"size": [2.0, 1.2], "spacing": H, "walls": walls, "gravity": list(gravity)},
-        time={"end": 1.0, "frames": 1},
-        solver={"precision": "f64"},
-        bodies=[
-            {
-                "name": "block",
-                "material": SOLID,
-                "shape": {"box": {"min": [0.6, 0.0], "max": [1.0, 0.3]}},
-                **body,
-            }
-        ],
+        precision="f64",
     )
 
 
@@ -240,17 +208,9 @@ def test_balls_leave_the_walls_that_they_hit(backend_of: Callable, record_proper
     """
     size, radius, speed = 2.4, 0.25, 1.0
     scene = scene_of(
+        body("ball", SOLID, ball([size / 2, 0.4], radius), velocity=[0.0, -speed]),
         domain={"size": [size, size], "spacing": H / 2, "walls": "separate"},
-        time={"end": 1.0, "frames": 1},
-        solver={"precision": "f64"},
-        bodies=[
-            {
-                "name": "ball",
-                "material": SOLID,
-                "shape": {"ball": {"center": [size / 2, 0.4], "radius": radius}},
-                "velocity": [0.0, -speed],
-            }
-        ],
+        precision="f64",
     )
     sample = sample_bodies(scene)[0]
     n, middle = sample.count, size / 2
@@ -290,16 +250,9 @@ def test_resting_fluid_stays_on_a_separating_floor(backend_of: Callable, record_
     """
     height, g, rho, K, h = 1.0, 9.81, 1000.0, 1.962e6, 1 / 32
     scene = scene_of(
+        block("column", {"law": "fluid", "density": rho, "bulk_modulus": K}, [0.0, 0.0], [8 * h, height]),
         domain={"size": [8 * h, 1.25], "spacing": h, "gravity": [0.0, -g], "walls": "separate"},
-        time={"end": 1.0, "frames": 1},
-        solver={"precision": "f64"},
-        bodies=[
-            {
-                "name": "column",
-                "material": {"law": "fluid", "density": rho, "bulk_modulus": K},
-                "shape": {"box": {"min": [0.0, 0.0], "max": [8 * h, height]}},
-            }
-        ],
+        precision="f64",
     )
     sample = sample_bodies(scene)[0]
     Y = sample.position[:, 1]
@@ -335,10 +288,7 @@ def test_resting_fluid_stays_on_a_separating_floor(backend_of: Callable, record_
     "material",
     [
         {"law": "fluid", "density": 1000.0, "bulk_modulus": 8e5},
-        pytest.param(
-            {"law": "sand", "density": 1600.0, "youngs_modulus": 6e5, "poissons_ratio": 0.3, "friction_angle": 35.0},
-            marks=pytest.mark.slow,
-        ),
+        slow({"law": "sand", "density": 1600.0, "youngs_modulus": 6e5, "poissons_ratio": 0.3, "friction_angle": 35.0}),
     ],
     ids=["water", "sand"],
 )
@@ -361,14 +311,7 @@ def test_what_falls_on_a_separating_wall_meets_it_where_it_is(
         },
         # A row of two particles bounces like one.
         time={"end": 2.4 if rows > 1 else 4.0, "frames": 480 if rows > 1 else 800, "safety": safety},
-        bodies=[
-            {
-                "name": "body",
-                "material": material,
-                "shape": {"box": {"min": [0.0, 3 * H], "max": [size, (3 + rows) * H]}},
-                "sampling": sampling,
-            }
-        ],
+        bodies=[block("body", material, [0.0, 3 * H], [size, (3 + rows) * H], sampling=sampling)],
     )
     frames = [frame for frame, _ in build_run(asked, backend_of("f32", 1)).frames()]
     gap = {frame.time: frame.position[:, 1].min() / H - 0.25 for frame in frames}

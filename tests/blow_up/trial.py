@@ -5,10 +5,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from scenes import block, scene_of
 
 from blow_up.scenes import SPACING, BlowUpScene
-from mpmcli.materials.registry import parameter_models
-from mpmcli.scene import BodyParticles, Scene, parse_scene
+from mpmcli.scene import BodyParticles, Scene
 from mpmcli.solver.engine.run import build_run
 from mpmcli.solver.frames.diagnosis import UnstableRunError
 from mpmcli.solver.machine.backend import Backend
@@ -144,13 +144,6 @@ class Trial:
 def _scene_of(scene: BlowUpScene, knobs: Mapping[str, object]) -> Scene:
     """Return the scene: one body whose particles are given, in a box with slip walls, without gravity."""
     d = scene.position.shape[1]
-    box = {"min": [0.0] * d, "max": [SPACING] * d}
-    return parse_scene(
-        {
-            "domain": {"size": [n * SPACING for n in scene.cells], "spacing": SPACING, "walls": "slip"},
-            "time": {"end": 1.0, "frames": 1},
-            "solver": {"precision": "f64", **knobs},
-            "bodies": [{"name": "body", "material": scene.material, "shape": {"box": box}}],
-        },
-        laws=parameter_models(),
-    ).scene
+    own = block("body", scene.material, [0.0] * d, [SPACING] * d)
+    solver = {"precision": "f64", **knobs}
+    return scene_of(own, cells=scene.cells, spacing=SPACING, walls="slip", solver=solver, contact={})

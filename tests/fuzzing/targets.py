@@ -52,36 +52,25 @@ def _tree(text: bytes, rng: Random) -> bytes:
     return _toml(found, text_mutant(text, rng)) if isinstance(found, dict) else text_mutant(text, rng)
 
 
-def _scene_values(rng: Random) -> Input:
-    files = seeds.chosen(seeds.scenes(), rng)
-    files["scene.toml"] = _tree(files["scene.toml"], rng)
-    return Input(files, _check(rng))
-
-
-def _scene_schema(rng: Random) -> Input:
-    files = seeds.chosen(seeds.scenes(), rng)
-    text = files["scene.toml"]
+def _by_schema(text: bytes, rng: Random) -> bytes:
     whole = rng.random() < 0.2
-    files["scene.toml"] = _toml(scene_of(rng) if whole else revised(tomllib.loads(text.decode()), rng), text)
-    return Input(files, _check(rng))
+    return _toml(scene_of(rng) if whole else revised(tomllib.loads(text.decode()), rng), text)
 
 
-def _scene_text(rng: Random) -> Input:
-    files = seeds.chosen(seeds.scenes(), rng)
-    files["scene.toml"] = text_mutant(files["scene.toml"], rng)
-    return Input(files, _check(rng))
+def _scene(change: Callable[[bytes, Random], bytes]) -> Callable[[Random], Input]:
+    def made(rng: Random) -> Input:
+        files = seeds.chosen(seeds.scenes(), rng)
+        files["scene.toml"] = change(files["scene.toml"], rng)
+        return Input(files, _check(rng))
+
+    return made
 
 
 def _override(rng: Random) -> Input:
     files = seeds.chosen(seeds.scenes(), rng)
     keys = (
-        "time.end",
-        "bodies[0].velocity",
-        "bodies.0.material.density",
-        "domain.gravity",
-        "solver.precision",
-        "title",
-    )
+        "time.end", "bodies[0].velocity", "bodies.0.material.density", "domain.gravity", "solver.precision", "title",
+    )  # fmt: skip
     said = f"{rng.choice(keys)}={value_mutant(rng)}".encode("utf-8", "replace")
     word = text_mutant(said, rng) if rng.random() < 0.5 else said
     word = word.replace(b"\0", b"0").decode("utf-8", "replace")
@@ -96,9 +85,9 @@ def _sweep(rng: Random) -> Input:
 
 
 TARGETS = {
-    "scene-schema": Target(_scene_schema, "scenes that follow the schema, whole ones and parts of examples"),
-    "scene-values": Target(_scene_values, "scenes, values of examples replaced, removed, moved"),
-    "scene-text": Target(_scene_text, "scenes, text of examples damaged"),
+    "scene-schema": Target(_scene(_by_schema), "scenes that follow the schema, whole ones and parts of examples"),
+    "scene-values": Target(_scene(_tree), "scenes, values of examples replaced, removed, moved"),
+    "scene-text": Target(_scene(text_mutant), "scenes, text of examples damaged"),
     "override": Target(_override, "--set"),
     "sweep": Target(_sweep, "sweeps and their base scenes"),
 }

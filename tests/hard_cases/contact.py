@@ -1,9 +1,10 @@
 """Neighbours that differ a thousandfold in density, and a body that hardly gives in volume."""
 
 import numpy as np
+from scenes import block
 
 from hard_cases.case import HardCase, Outcome
-from hard_cases.running import GRAVITY, block, growth, run, scene, start
+from hard_cases.running import GRAVITY, growth, run, scene, start
 from mpmcli.scene import sample_bodies
 
 
@@ -45,14 +46,7 @@ def sag(ratio: float, **solver: object) -> tuple[float, float, bool]:
     # Half a period of the first mode of a beam, w L^2 = 3.516 sqrt(E' I / (rho A)), and some more for shear.
     end = 1.2 * np.pi * length**2 / (3.516 * thick * np.sqrt(plane / 12 / 1000.0))
     asked = scene(
-        [body],
-        [26, 16],
-        h,
-        end=end,
-        frames=60,
-        gravity=0.1,
-        walls=walls,
-        fields=["velocity", "stress", "volume_ratio"],
+        [body], [26, 16], h, end=end, frames=60, gravity=0.1, walls=walls, fields=["velocity", "stress", "volume_ratio"]
     )
     asked = asked.model_copy(update={"solver": asked.solver.model_copy(update=solver)})
     sample = sample_bodies(asked)[0]
@@ -89,20 +83,10 @@ def beam(ratio: float) -> float:
 
 
 CASES = [
-    HardCase(
-        "H4",
-        "density ratio 1:1000",
+    HardCase("H4", "density ratio 1:1000",
         "water on the left half of a layer of a fluid of a thousandth of its density, 1 s",
-        "no NaN; the step is that of the lighter; mass stays and energy rises by 1e-3 at most",
-        True,
-        density_ratio,
-    ),
-    HardCase(
-        "H10",
-        "nu = 0.4999",
+        "no NaN; the step is that of the lighter; mass stays and energy rises by 1e-3 at most", True, density_ratio),
+    HardCase("H10", "nu = 0.4999",
         "a clamped beam, 1 x 0.2 m on 20 x 4 cells, that takes up its weight, at nu = 0.49 and 0.4999, AFLIP 0.95",
-        "the tip falls as far as by beam theory to 3 %; pressure varies in a cell by 15 % at most",
-        True,
-        locking,
-    ),
-]
+        "the tip falls as far as by beam theory to 3 %; pressure varies in a cell by 15 % at most", True, locking),
+]  # fmt: skip

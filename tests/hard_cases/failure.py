@@ -1,52 +1,25 @@
 """States that are not finite, set on purpose: how soon the run stops, and whom it names."""
 
-from collections.abc import Callable
-
 import numpy as np
+from scenes import block, liquid
 
 from hard_cases.case import HardCase, Outcome
-from hard_cases.running import block, scene, start
-from mpmcli.solver.engine.run_group import RunGroup
+from hard_cases.running import scene, start
 from mpmcli.solver.frames.diagnosis import Diagnosis, UnstableRunError
 
 H = 0.1
 PARTICLE = 7
 
 
-def poison_deformation(group: RunGroup, place: int) -> None:
-    """Set J of one particle to NaN."""
-    values = group.read()["deformation"]
-    values[place] = np.nan
-    group.replace(deformation=values)
+# What is set, in which field.
+POISONS = {"J": ("deformation", np.nan), "v": ("v", np.nan), "C": ("C", np.inf)}
 
 
-def poison_velocity(group: RunGroup, place: int) -> None:
-    """Set the velocity of one particle to NaN."""
-    values = group.read()["v"]
-    values[place] = np.nan
-    group.replace(v=values)
-
-
-def poison_affine(group: RunGroup, place: int) -> None:
-    """Set the affine velocity of one particle to infinity."""
-    values = group.read()["C"]
-    values[place] = np.inf
-    group.replace(C=values)
-
-
-POISONS: dict[str, Callable[[RunGroup, int], None]] = {
-    "J": poison_deformation,
-    "v": poison_velocity,
-    "C": poison_affine,
-}
-
-
-def stop_after(poison: Callable[[RunGroup, int], None]) -> tuple[Diagnosis | None, int]:
+def stop_after(field: str, value: float) -> tuple[Diagnosis | None, int]:
     """Return the diagnosis of a run of two bodies that is poisoned after 20 steps, and the step then."""
-    water = {"law": "fluid", "density": 1000.0, "bulk_modulus": 1e4}
     bodies = [
-        block("drop", water, [0.2] * 2, [0.6] * 2, velocity=[0.1, 0.1]),
-        block("second drop", {**water, "density": 700.0}, [1.0] * 2, [1.4] * 2, velocity=[-0.1, 0.1]),
+        block("drop", liquid(1e4), [0.2] * 2, [0.6] * 2, velocity=[0.1, 0.1]),
+        block("second drop", liquid(1e4, density=700.0), [1.0] * 2, [1.4] * 2, velocity=[-0.1, 0.1]),
     ]
     run = start(scene(bodies, [16, 16], H))
     for _ in range(20):
@@ -54,7 +27,9 @@ def stop_after(poison: Callable[[RunGroup, int], None]) -> tuple[Diagnosis | Non
     group = run.groups[0]
     # The particles of the first body are those with the smallest ids.
     first = 64
-    poison(group, int(np.flatnonzero(group.read()["id"] == first + PARTICLE)[0]))
+    values = group.read()[field]
+    values[np.flatnonzero(group.read()["id"] == first + PARTICLE)[0]] = value
+    group.replace(**{field: values})
     began = run.step_count
     try:
         for _ in range(20):
@@ -68,7 +43,7 @@ def named() -> Outcome:
     """H23: NaN in J and v and infinity in C of one particle of the second of two bodies."""
     right, said = True, []
     for name, poison in POISONS.items():
-        found, began = stop_after(poison)
+        found, began = stop_after(*poison)
         if found is None:
             right = False
             said.append(f"{name}: the run goes on")
@@ -83,12 +58,7 @@ def named() -> Outcome:
 
 
 CASES = [
-    HardCase(
-        "H23",
-        "a NaN appears",
+    HardCase("H23", "a NaN appears",
         "J or v of a particle of the second of two bodies is set to NaN, or its C to infinity",
-        "stops within one step, with step, particle and body",
-        True,
-        named,
-    ),
-]
+        "stops within one step, with step, particle and body", True, named),
+]  # fmt: skip

@@ -6,9 +6,10 @@ from dataclasses import replace
 from multiprocessing import get_context
 
 import numpy as np
+from scenes import block
 
 from hard_cases.case import HardCase, Outcome
-from hard_cases.running import GRAVITY, block, look, run, scene, sound, start
+from hard_cases.running import GRAVITY, run, scene, sound, start
 from mpmcli.errors import InputError
 from mpmcli.scene import sample_bodies
 from mpmcli.solver.frames.diagnosis import NOT_FINITE, UnstableRunError
@@ -41,7 +42,7 @@ def droplets(steps: int) -> Outcome:
         for step in range(steps):
             run.step(dt)
             if step % (20 if step < 2000 else 500) == 0 or step == steps - 1:
-                frame, row = look(run)
+                frame, row = run.frame()
                 fine = fine and sound(frame, row)
                 worst = max(worst, row.speed_max / fall)
                 low, high = min(low, row.volume_ratio_min), max(high, row.volume_ratio_max)
@@ -138,29 +139,14 @@ def leaving() -> Outcome:
 
 
 CASES = [
-    HardCase(
-        "H1",
-        "isolated fluid particles",
+    HardCase("H1", "isolated fluid particles",
         "one particle and two clusters of three, with and without suction, dt = 0.6 h/c, 1e5 steps in gravity",
-        "max|v| never above the speed of the fall; J in [0.1, 2]; no NaN",
-        True,
-        lambda: droplets(100_000),
-        lambda: droplets(2_000),
-    ),
-    HardCase(
-        "H7",
-        "tiny nodal mass",
+        "max|v| never above the speed of the fall; J in [0.1, 2]; no NaN", True, lambda: droplets(100_000),
+        lambda: droplets(2_000)),
+    HardCase("H7", "tiny nodal mass",
         "a particle at 1.499 h from a node along both axes, alone, beside another, and in a corner of walls",
-        "per axis |a| <= 6 |tau| / (rho h) at every node",
-        False,
-        edge_of_a_node,
-    ),
-    HardCase(
-        "H8",
-        "particles leave the domain",
+        "per axis |a| <= 6 |tau| / (rho h) at every node", False, edge_of_a_node),
+    HardCase("H8", "particles leave the domain",
         "a ball at 30 c against the wall; a step of 30 cells; a body outside; particles given outside, and NaN",
-        "goes on or stops with a sentence; no out-of-range write, no crash of the interpreter",
-        True,
-        leaving,
-    ),
-]
+        "goes on or stops with a sentence; no out-of-range write, no crash of the interpreter", True, leaving),
+]  # fmt: skip

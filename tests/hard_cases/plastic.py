@@ -3,9 +3,10 @@
 from dataclasses import replace
 
 import numpy as np
+from scenes import block
 
 from hard_cases.case import HardCase, Outcome
-from hard_cases.running import GRAVITY, block, look, run, scene, sound, start
+from hard_cases.running import GRAVITY, run, scene, sound, start
 from mpmcli.scene import sample_bodies
 
 H, SIDE = 0.1, 0.8
@@ -116,9 +117,7 @@ def steep_sand() -> Outcome:
     shear = np.zeros((3, 3))
     shear[0, 1] = 6 * strain / time
     start_at = replace(
-        cube,
-        velocity=(cube.position - cube.position.mean(0)) @ shear.T,
-        affine=np.tile(shear, (cube.count, 1, 1)),
+        cube, velocity=(cube.position - cube.position.mean(0)) @ shear.T, affine=np.tile(shear, (cube.count, 1, 1))
     )
     run = start(asked, [start_at])
     run.groups[0].replace(deformation=np.tile(np.exp(-strain) * np.eye(3), (cube.count, 1, 1)))
@@ -127,49 +126,27 @@ def steep_sand() -> Outcome:
     ratios = []
     while run.time < time:
         run.step(min(run.stable_step()[0] / 2, time - run.time + 1e-12))
-        frame, _ = look(run)
+        frame, _ = run.frame()
         stress = frame.fields["stress"].reshape(-1, 3, 3)[middle, :2, :2].astype(np.float64)
         s3, s1 = np.linalg.eigvalsh(stress).mean(0)
         ratios.append((s1 - s3) / -(s1 + s3))
     found = float(np.degrees(np.arcsin(min(1.0, ratios[-1]))))
     return Outcome(
-        sound(*look(run)) and abs(found - phi) < 0.5 and abs(ratios[-1] - ratios[-2]) < 1e-3,
+        sound(*run.frame()) and abs(found - phi) < 0.5 and abs(ratios[-1] - ratios[-2]) < 1e-3,
         f"yields at {found:.2f} degrees",
         f"After a shear of {100 * strain * 6:.1f} %; the ratio of stresses no longer changes.",
     )
 
 
 CASES = [
-    HardCase(
-        "H15",
-        "hardening snow",
+    HardCase("H15", "hardening snow",
         "a cube of snow whose sides move in at 80 m/s, until it fills less than half of its area",
-        "the wave limit falls as 1 / sqrt(hardening), which stays below its limit of 100; no NaN",
-        True,
-        packed_snow,
-    ),
-    HardCase(
-        "H16",
-        "volume gain of sand",
+        "the wave limit falls as 1 / sqrt(hardening), which stays below its limit of 100; no NaN", True, packed_snow),
+    HardCase("H16", "volume gain of sand",
         "sand thrown up by 2 cos^2(2 pi x / W) y / H m/s and landed, with and without volume correction",
-        "the deposit gains < 5 % with correction, > 10 % without",
-        True,
-        volume_gain,
-    ),
-    HardCase(
-        "H17",
-        "tip of the cone",
-        "a cube of sand that falls freely and expands",
-        "no NaN, no stress, free fall of the centre of mass to 1e-5",
-        True,
-        free_fall,
-    ),
-    HardCase(
-        "H20",
-        "steep friction angle in 3D",
-        "sand of 45 degrees in 3D, compressed and sheared in plane strain",
-        "yields at 45 degrees in the plane, where Klar's alpha would never",
-        True,
-        steep_sand,
-    ),
-]
+        "the deposit gains < 5 % with correction, > 10 % without", True, volume_gain),
+    HardCase("H17", "tip of the cone", "a cube of sand that falls freely and expands",
+        "no NaN, no stress, free fall of the centre of mass to 1e-5", True, free_fall),
+    HardCase("H20", "steep friction angle in 3D", "sand of 45 degrees in 3D, compressed and sheared in plane strain",
+        "yields at 45 degrees in the plane, where Klar's alpha would never", True, steep_sand),
+]  # fmt: skip

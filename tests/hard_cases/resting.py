@@ -3,9 +3,10 @@
 from dataclasses import replace
 
 import numpy as np
+from scenes import block
 
 from hard_cases.case import HardCase, Outcome
-from hard_cases.running import GRAVITY, block, look, scene, sound, start
+from hard_cases.running import GRAVITY, scene, sound, start
 from mpmcli.scene import sample_bodies
 from mpmcli.solver.engine.run import Run
 
@@ -28,12 +29,7 @@ def column(law: str, precision: str) -> Run:
     modulus = 1.962e6
     materials = {
         "fluid": {"law": "fluid", "density": DENSITY, "bulk_modulus": modulus},
-        "neo_hookean": {
-            "law": "neo_hookean",
-            "density": DENSITY,
-            "youngs_modulus": modulus,
-            "poissons_ratio": 0.0,
-        },
+        "neo_hookean": {"law": "neo_hookean", "density": DENSITY, "youngs_modulus": modulus, "poissons_ratio": 0.0},
     }
     body = block("column", materials[law], [0, 0], [width * h, height])
     walls = {"default": "slip", "y_min": "separate"}
@@ -63,7 +59,7 @@ def jitter(precision: str) -> Outcome:
         while run.time < 2.0:
             for _ in range(20):
                 run.step(run.stable_step()[0])
-            frame, row = look(run)
+            frame, row = run.frame()
             fine = fine and sound(frame, row)
             if run.time > 1.0:
                 fastest = max(fastest, row.speed_max)
@@ -89,7 +85,7 @@ def block_at_rest(steps: int) -> Outcome:
     for part in range(1, 21):
         while run.step_count < part * steps // 20:
             run.step(run.stable_step()[0])
-        frame, row = look(run)
+        frame, row = run.frame()
         fine = fine and sound(frame, row)
         places.append(frame.position.astype(np.float64))
         kinetic.append(row.kinetic / scale)
@@ -125,7 +121,7 @@ def slosh(periods: int) -> Outcome:
     for part in range(4 * periods):
         while run.time < (part + 1) * period / 4:
             run.step(run.stable_step()[0])
-        frame, row = look(run)
+        frame, row = run.frame()
         fine = fine and sound(frame, row)
         centres.append(frame.position.astype(np.float64).mean(0))
         kinetic.append(row.kinetic)
@@ -151,20 +147,11 @@ def long_runs(steps: int, periods: int) -> Outcome:
 
 
 CASES = [
-    HardCase(
-        "H11",
-        "long runs",
+    HardCase("H11", "long runs",
         "a rubber block set on the floor, 2e5 steps; the first slosh mode of a tank on 16 x 8 cells, 100 periods",
-        "centre of mass and particles drift by < 0.1 h; at the end KE < 1e-8 m g H",
-        True,
-        lambda: long_runs(200_000, 100),
-    ),
-    HardCase(
-        "H14",
-        "jitter at rest",
+        "centre of mass and particles drift by < 0.1 h; at the end KE < 1e-8 m g H", True,
+        lambda: long_runs(200_000, 100)),
+    HardCase("H14", "jitter at rest",
         "columns of water and of rubber, 1 m high, that start in the state of rest; h = 1/32, f32",
-        "max|v| < 1e-3 sqrt(g H) from 1 s to 2 s",
-        True,
-        lambda: jitter("f32"),
-    ),
-]
+        "max|v| < 1e-3 sqrt(g H) from 1 s to 2 s", True, lambda: jitter("f32")),
+]  # fmt: skip

@@ -4,11 +4,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scenes import scene_of
 
 from mpmcli.frames.frame import Frame
 from mpmcli.frames.ledger import LedgerRow
-from mpmcli.materials.registry import parameter_models
-from mpmcli.scene import BodyParticles, Scene, parse_scene
+from mpmcli.scene import BodyParticles, Scene
 from mpmcli.solver.engine.run import Run, build_run
 from mpmcli.solver.frames.diagnosis import UnstableRunError
 from mpmcli.solver.machine.backend import start_backend, stop_backend
@@ -16,55 +16,31 @@ from mpmcli.solver.machine.backend import start_backend, stop_backend
 GRAVITY = 9.81
 
 
-def block(name: str, material: dict, low: Sequence[float], high: Sequence[float], **more: object) -> dict:
-    """Return the table of a body that is a box."""
-    box = {"min": [float(x) for x in low], "max": [float(x) for x in high]}
-    return {"name": name, "material": material, "shape": {"box": box}, **more}
-
-
 def scene(
     bodies: Sequence[dict],
     cells: Sequence[int],
     spacing: float,
     *,
-    end: float = 1.0,
-    frames: int = 1,
     gravity: float = 0.0,
-    walls: object = "separate",
-    precision: str = "f32",
     origin: float = 0.0,
     fields: Sequence[str] = ("velocity", "volume_ratio", "affine"),
-    step: float | str = "auto",
+    **keys: object,
 ) -> Scene:
     """Return a scene of these cells, gravity (m/s^2) downwards and the lower corner at `origin` on each axis."""
     d = len(cells)
-    return parse_scene(
-        {
-            "domain": {
-                "size": [n * spacing for n in cells],
-                "spacing": spacing,
-                "walls": walls,
-                "gravity": [0.0] * (d - 1) + [-gravity],
-                "origin": [origin] * d,
-            },
-            "time": {"end": float(end), "frames": frames, "step": step},
-            "output": {"fields": list(fields)},
-            "solver": {"precision": precision},
-            "bodies": list(bodies),
-        },
-        laws=parameter_models(),
-    ).scene
+    return scene_of(
+        *bodies,
+        domain={"cells": cells, "spacing": spacing, "gravity": [0.0] * (d - 1) + [-gravity], "origin": [origin] * d},
+        fields=list(fields),
+        contact={},
+        **keys,
+    )
 
 
 def start(asked: Scene, particles: list[BodyParticles] | None = None) -> Run:
     """Return a run on a backend of its own, one thread of the CPU; earlier runs die."""
     stop_backend()
     return build_run(asked, start_backend("cpu", 1, asked.solver.precision), particles)
-
-
-def look(run: Run) -> tuple[Frame, LedgerRow]:
-    """Return the state of a run at this moment."""
-    return run.frame()
 
 
 def sound(frame: Frame, row: LedgerRow) -> bool:
