@@ -235,6 +235,7 @@ def test_the_commands_make_what_the_readme_says(commands, checkout):
     assert json.loads((checkout / "scene.schema.json").read_text(encoding="utf-8"))["title"] == "Scene"
     assert "centre of ball, y, at 1 s: 0.3" in commands["mpmcli validate results/drop"].stdout
     assert sorted(path.name for path in (checkout / "results" / "drop").iterdir()) == [
+        "cameras",
         "error_bars",
         "ledger.png",
         "particles.vtkhdf",
@@ -243,6 +244,7 @@ def test_the_commands_make_what_the_readme_says(commands, checkout):
         "scene.toml",
     ]
     assert {path.name for path in (checkout / "results" / "drop" / "render").iterdir()} >= {"dots_000025.png"}
+    assert len(list((checkout / "results" / "drop" / "cameras" / "camera").glob("mask_*.png"))) == 51
     assert all((checkout / "results" / name).stat().st_size > 1000 for name in ("drop.mp4", "drop.png"))
 
 
