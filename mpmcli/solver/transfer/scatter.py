@@ -3,9 +3,9 @@
 from mpmcli.quick_taichi import ti
 from mpmcli.solver.contact.total_solids import friction_of_walls
 from mpmcli.solver.particles.arrays import MASS, VOLUME, ParticleArrays, constants_of
-from mpmcli.solver.particles.loop import Operation, Pass
+from mpmcli.solver.particles.loop import INDEX, Operation, Pass
 from mpmcli.solver.particles.state_bounds import SMALLEST_J, volume_ratio
-from mpmcli.solver.transfer.advance import LOCATE
+from mpmcli.solver.transfer.advance import locate
 from mpmcli.solver.transfer.particle_step import ExternalLoads, Sender, p2g
 from mpmcli.solver.transfer.run_sums import RunSums, move_to
 from mpmcli.solver.transfer.stencils import add_linear
@@ -19,6 +19,8 @@ def scatter_of(group: ParticleArrays, *, keeps: bool, repels: bool) -> Operation
     are the `RunSums` of the thread, or None.
     """
     pushes = {"push": ("d",), "slope": ("d", "d")}
+    # In one pass, which is 2 % of a step faster than to locate particles before.
+    stencil, sent = {"first": INDEX, "w": ("nodes", "d")}, {"middle": ("width",), "change": ("d", "width")}
     writes = ("deformation", "inner") if group.law.projects else ()
     return Operation(
         reads=("x", "place", "v", "C", "deformation", "inner", "row", *["borne"] * group.eased),
@@ -28,12 +30,7 @@ def scatter_of(group: ParticleArrays, *, keeps: bool, repels: bool) -> Operation
             Pass(push_by_forces if group.is_pushed else None, pushes),
             Pass(push_by_bodies if repels and group.total else None, {"touch": ("d",)}),
             Pass(rub_on_walls if group.has_wall_friction else None, {"friction": ("d",)}),
-            LOCATE,
-            Pass(
-                send,
-                {"middle": ("width",), "change": ("d", "width"), "deformation": None, "inner": None, "sound": ()},
-                in_lanes=True,
-            ),
+            Pass(send, stencil | sent | {"deformation": None, "inner": None, "sound": ()}, in_lanes=True),
             Pass(add),
         ),
         guarded=writes,
@@ -80,7 +77,7 @@ def rub_on_walls(at: ti.template(), p: int, kick: float):
 @ti.func
 def send(
     at: ti.template(),
-    _p: int,
+    p: int,
     kick: float,
     place: ti.template(),
     x: ti.template(),
@@ -96,13 +93,13 @@ def send(
     slope: ti.template(),
     touch: ti.template(),
     friction: ti.template(),
-    apart: ti.template(),
 ):
-    """Return what a particle adds to nodes, its state after plastic flow, and whether it is not crushed or inverted.
+    """Return the stencil of a particle, see `locate`, what it adds to nodes, and its state after plastic flow.
 
-    The stress of a crushed particle would spread NaN over the grid.
+    The last value is whether it is neither crushed nor inverted: its stress would spread NaN over the grid.
     """
     (group,) = ti.static((at.group,))
+    first, w, apart = locate(at, p, kick, place)
     state, constants = group.whole(deformation), constants_of(row)
     (loads,) = ti.static((ExternalLoads(share, missing, push, slope, touch, friction),))
     (own,) = ti.static((Sender(place, x, v, C, state, inner, row, constants, loads, borne),))
@@ -111,7 +108,7 @@ def send(
     if ti.static(group.law.projects):
         after = deformation + plastic
     sound = ti.cast(volume_ratio(group, state) > SMALLEST_J, float)
-    return middle, change, after, inner_after, sound
+    return first, w, middle, change, after, inner_after, sound
 
 
 @ti.func
