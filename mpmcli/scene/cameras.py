@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import AfterValidator, Field, ValidationInfo, model_validator
 
-from mpmcli.scene.entry import Entry, OfTime, value_of, varies
+from mpmcli.scene.entry import Entry, OfTime, value_of
 from mpmcli.scene.primitives import unit
 from mpmcli.scene.problem import Problem
 from mpmcli.scene.quantity import (
@@ -145,11 +145,6 @@ class PlacedCamera:
             return np.array([float(value_of(entry, t=time)) for entry in entries])
         times, values = zip(*keys, strict=True)
         return np.array([np.interp(time, times, column) for column in zip(*values, strict=True)])
-
-    @property
-    def moves(self) -> bool:
-        """Whether it depends on time."""
-        return bool(self.path) or varies(*(self.position or ()), *self.target)
 
 
 def placed_cameras(
