@@ -4,16 +4,17 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from added_operation import Marker, fields_with_mark
+from added_operation import Marker, fields_with_mark, raised
 from scenes import block, scene_of
 from test_batch import batch_of, outputs_of
 
 from mpmcli.scene import Scene
-from mpmcli.solver.engine import batch, kernel_store
+from mpmcli.solver.engine import batch
 from mpmcli.solver.engine.compiled_kind import CompiledKind
 from mpmcli.solver.engine.run import build_run
 from mpmcli.solver.features import Features
 from mpmcli.solver.particles import arrays
+from mpmcli.solver.particles.loop import Operation, Pass
 
 STEP, COUNT = 1e-3, 60
 # Sorts follow each other by about ten steps.
@@ -33,7 +34,6 @@ class WithMarker(Features):
 def added(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(batch, "Features", WithMarker)
     monkeypatch.setattr(arrays, "fields_of", fields_with_mark)
-    monkeypatch.setenv(kernel_store.SWITCH, "off")
 
 
 def thrown(speed: float = FAST, *, precision: str = "f64", **solver: object) -> Scene:
@@ -92,3 +92,10 @@ def test_runs_of_a_batch_have_markers_of_their_own(backend_of: Callable) -> None
     outputs_of(together, scenes)
     np.testing.assert_array_equal(marks(together), alone)
     assert not np.array_equal(*alone)
+
+
+def test_an_operation_writes_what_a_pass_gives() -> None:
+    """A column whose name no pass gives would keep its values without a word."""
+    keep = Pass(raised, {"marked": ()})
+    with pytest.raises(ValueError, match="writes mark, which none of its passes gives"):
+        Operation(reads=("C", "marked"), passes=(keep,), writes=("mark",))

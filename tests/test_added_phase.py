@@ -10,7 +10,7 @@ from scenes import block, scene_of
 from taichi.lang import kernel_impl
 
 from mpmcli.scene import Scene
-from mpmcli.solver.engine import batch, kernel_store
+from mpmcli.solver.engine import batch
 from mpmcli.solver.engine.batch import Batch
 from mpmcli.solver.engine.compiled_kind import CompiledKind
 from mpmcli.solver.engine.plan import make_plan
@@ -35,7 +35,6 @@ class WithDrag(Features):
 @pytest.fixture(autouse=True)
 def added(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(batch, "Features", WithDrag)
-    monkeypatch.setenv(kernel_store.SWITCH, "off")
 
 
 def flying(rate: float = RATE, *, precision: str = "f64", frames: int = 1, **more: dict) -> Scene:
@@ -107,7 +106,9 @@ def test_runs_of_a_batch_have_drags_of_their_own(backend_of: Callable) -> None:
         np.testing.assert_allclose(own, np.multiply(left(rate), STARTS[1]), rtol=1e-5, atol=1e-6)
 
 
-def test_it_is_planned_to_the_byte_and_absent_elsewhere(backend_of: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_is_planned_to_the_byte_and_absent_elsewhere(
+    backend_of: Callable, monkeypatch: pytest.MonkeyPatch, own_kernels: None
+) -> None:
     """Two numbers of a run and a pass of its step; without a drag nothing calls its function."""
     asked, backend, called, call = flying(), backend_of("f64", 1), set(), kernel_impl.Func.__call__
 

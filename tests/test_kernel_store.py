@@ -8,14 +8,16 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from conftest import ROOT
 from scenes import block, body, box, liquid, scene_of, solid
 
+from mpmcli.boundaries.feature import Feature
 from mpmcli.materials import fluid
 from mpmcli.scene import Scene
 from mpmcli.solver.engine import batch, kernel_store
@@ -313,16 +315,18 @@ def test_prose_is_docstrings_and_comments() -> None:
 
 
 def test_what_is_not_known_is_not_stored(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Laws from elsewhere, another version of Taichi, modules that are younger than the process, no cache."""
+    """Laws or features from elsewhere, another version of Taichi, modules younger than the process, no cache."""
     scene = drop()
     kind = Resolved(scene).kind
     backend = choose_backend("cpu", 1, "f32")
 
-    def may_store(kind: CompiledKind = kind, backend: Backend = backend) -> bool:
-        return kernel_store.StoredLaunch(None, kind, backend)._may_store()
+    def may_store(kind: CompiledKind = kind, backend: Backend = backend, features: Sequence[Feature] = ()) -> bool:
+        launch = SimpleNamespace(device=SimpleNamespace(features=features))
+        return kernel_store.StoredLaunch(launch, kind, backend)._may_store()
 
     monkeypatch.setattr(kernel_store, "_unchanged_since", lambda began: True)
-    assert may_store()
+    assert may_store() and may_store(features=[Feature()])
+    assert not may_store(features=[type("Marker", (Feature,), {"__module__": "marker"})()])
     foreign = type("Law", (type(kind.members[0]),), {"__module__": "law"})
     assert not may_store(replace(kind, members=(object.__new__(foreign),)))
     assert not may_store(backend=replace(backend, compile_cache=False))

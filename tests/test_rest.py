@@ -14,7 +14,7 @@ from mpmcli.check.result_check import check_kept
 from mpmcli.frames.ledger import LedgerRow
 from mpmcli.quick_taichi import ti
 from mpmcli.scene import Scene
-from mpmcli.solver.engine import batch, kernel_store
+from mpmcli.solver.engine import batch
 from mpmcli.solver.engine.compiled_kind import CompiledKind
 from mpmcli.solver.engine.run import build_run
 from mpmcli.solver.features import Features
@@ -110,7 +110,6 @@ def obstacles(seed: int) -> Scene:
 def test_contact_takes_energy_in_every_step(backend_of: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of fifty random scenes in which contact begins and breaks; a step may gain by rounding, f64."""
     monkeypatch.setattr(batch, "Features", Watched)
-    monkeypatch.setenv(kernel_store.SWITCH, "off")
     made = batch_of([obstacles(seed) for seed in range(50)], backend_of("f64", 1))
     found = outputs_of(made, [obstacles(seed) for seed in range(50)])
     watch = made.device.features.watch

@@ -112,8 +112,9 @@ class StoredLaunch:
         self._kernel = self._launch.launch
 
     def _may_store(self) -> bool:
-        """Return whether all inputs of the kernel are known; laws of plugins may import anything."""
-        own = all(type(law).__module__.startswith("mpmcli.") for law in self._kind.members)
+        """Return whether all inputs of the kernel are known; laws and features from elsewhere may import anything."""
+        parts = (*self._kind.members, *self._launch.device.features)
+        own = all(type(part).__module__.startswith("mpmcli.") for part in parts)
         known = own and ti.__version__ in KNOWN_VERSIONS and _unchanged_since(psutil.Process().create_time())
         return known and self._backend.compile_cache and os.environ.get(SWITCH) != "off"
 

@@ -16,6 +16,7 @@ import tempfile
 import textwrap
 import time
 import weakref
+from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
@@ -24,6 +25,8 @@ from types import CodeType, SimpleNamespace
 from typing import Literal
 
 import numpy as np
+from taichi.lang import kernel_impl
+from taichi.lang.ast import transform_tree
 from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 from taichi.lang.kernel_impl import Kernel
 
@@ -55,6 +58,8 @@ LONGEST_LOCK = 60.0
 _started: "Backend | None" = None
 # Functions called once after the backend has stopped.
 _endings: list[Callable[[], None]] = []
+# Syntax trees of the functions that a kernel has inlined, by their source.
+_trees: defaultdict[str, list[ast.Module]] = defaultdict(list)
 
 
 @dataclass(frozen=True)
@@ -242,12 +247,33 @@ def _position(context: ASTTransformerContext, node: ast.AST) -> str:
 
 @cache
 def _source(code: CodeType) -> tuple[list[str], int]:
-    """Return the lines of a function and the number of the first; the cached code object keeps no fields alive.
+    """Return the lines of a function, dedented, and the number of the first; the code object keeps no fields alive.
 
     `inspect.getsourcelines` would search all loaded modules.
     """
     first = code.co_firstlineno
-    return inspect.getblock(linecache.getlines(code.co_filename)[first - 1 :]), first
+    lines = inspect.getblock(linecache.getlines(code.co_filename)[first - 1 :])
+    return textwrap.dedent("".join(lines)).splitlines(), first
+
+
+def _tree_of(text: str) -> ast.Module:
+    """Return a syntax tree of a function that no function under construction uses: one may inline itself."""
+    free = _trees[text]
+    tree = free.pop() if free else ast.parse(text)
+    tree.text = text
+    return tree
+
+
+def _built(tree: ast.Module, context: ASTTransformerContext) -> object:
+    """Build a function from its syntax tree, which is kept for the next time that the same kernel inlines it."""
+    result = transform_tree(tree, context)
+    if context.is_kernel:
+        # Trees refer to the fields of a kernel.
+        _trees.clear()
+    elif not context.is_real_function:
+        # Taichi removes the parameters of other functions from their trees.
+        _trees[tree.text].append(tree)
+    return result
 
 
 def _builder(kernel: Kernel) -> object:
@@ -283,9 +309,11 @@ def _initialise(backend: Backend) -> None:
     Kernel.ast_builder = _builder
     # Taichi recomputes these each time it inlines a function, and wraps lines at 9,999 columns, which together is a
     # fifth of the time of its front end.
-    ti.lang.kernel_impl.getsourcelines = lambda function: _source(function.__code__)
-    ti.lang.kernel_impl.getsourcefile = lambda function: function.__code__.co_filename
-    ti.lang.kernel_impl.textwrap = SimpleNamespace(fill=lambda line, **_: line.rstrip(), dedent=textwrap.dedent)
+    kernel_impl.getsourcelines = lambda function: _source(function.__code__)
+    kernel_impl.getsourcefile = lambda function: function.__code__.co_filename
+    kernel_impl.textwrap = SimpleNamespace(fill=lambda line, **_: line, dedent=str)
+    # It also parses the function again, which is another fifth.
+    kernel_impl.ast, kernel_impl.transform_tree = SimpleNamespace(parse=_tree_of), _built
     # Before it reads `log_level`, Taichi would warn of each environment variable that `ti.init` overrides.
     ti.set_logging_level(ti.ERROR)
     with contextlib.redirect_stdout(io.StringIO()):

@@ -76,6 +76,12 @@ class Operation:
     largest: str = ""
     near: bool = False
 
+    def __post_init__(self) -> None:
+        """Raise ValueError if a column is written that nothing gives: it would be written as it was."""
+        given = {name for step in self.passes for name in step.gives}
+        if missing := sorted({*self.writes, *self.guarded, *([self.largest] if self.largest else [])} - given):
+            raise ValueError(f"an operation writes {', '.join(missing)}, which none of its passes gives")
+
     @property
     def loses(self) -> bool:
         """Whether it finds particles that are not sound."""
@@ -305,12 +311,12 @@ def over_lanes(at: ti.template(), op: ti.template(), first: int, last: int, how:
         sound = count
         if ti.static(op.loses):
             sound = 0
-            for lane in range(count):
+            for lane in range(LANES):
                 sound += ti.cast(values.arrays["sound"][0, lane], int)
         if ti.static(len(op.largest) > 0):
             for lane in range(count):
                 most = ti.max(most, values.arrays[op.largest][0, lane])
-        if sound == LANES:
+        if count == LANES and sound == LANES:
             # Entry by entry, so that entries of neighbouring particles are stored at once.
             for name in ti.static(op.writes + op.guarded):
                 (column,) = ti.static((at.group.column(name),))

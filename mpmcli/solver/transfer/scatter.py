@@ -30,7 +30,7 @@ def scatter_of(group: ParticleArrays, *, keeps: bool, repels: bool) -> Operation
             Pass(push_by_forces if group.is_pushed else None, pushes),
             Pass(push_by_bodies if repels and group.total else None, {"touch": ("d",)}),
             Pass(rub_on_walls if group.has_wall_friction else None, {"friction": ("d",)}),
-            Pass(send, stencil | sent | {"deformation": None, "inner": None, "sound": ()}, in_lanes=True),
+            Pass(send, stencil | sent | {"sound": ()} | dict.fromkeys(writes), in_lanes=True),
             Pass(add),
         ),
         guarded=writes,
@@ -94,9 +94,10 @@ def send(
     touch: ti.template(),
     friction: ti.template(),
 ):
-    """Return the stencil of a particle, see `locate`, what it adds to nodes, and its state after plastic flow.
+    """Return the stencil of a particle, see `locate`, what it adds to nodes, whether it is sound, and its state.
 
-    The last value is whether it is neither crushed nor inverted: its stress would spread NaN over the grid.
+    It is sound if it is neither crushed nor inverted: its stress would spread NaN over the grid. The state is that
+    after plastic flow.
     """
     (group,) = ti.static((at.group,))
     first, w, apart = locate(at, p, kick, place)
@@ -104,11 +105,11 @@ def send(
     (loads,) = ti.static((ExternalLoads(share, missing, push, slope, touch, friction),))
     (own,) = ti.static((Sender(place, x, v, C, state, inner, row, constants, loads, borne),))
     middle, change, plastic, inner_after = p2g(at.particles, group, own, apart, kick)
-    after = deformation
-    if ti.static(group.law.projects):
-        after = deformation + plastic
     sound = ti.cast(volume_ratio(group, state) > SMALLEST_J, float)
-    return first, w, middle, change, after, inner_after, sound
+    if ti.static(group.law.projects):
+        return first, w, middle, change, sound, deformation + plastic, inner_after
+    else:
+        return first, w, middle, change, sound
 
 
 @ti.func
