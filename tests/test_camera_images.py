@@ -18,7 +18,8 @@ from mpmcli.output import Result
 from mpmcli.render import reconstruction
 from mpmcli.render.camera_images import image_request
 from mpmcli.render.request import Request
-from mpmcli.scene.cameras import CameraFile, placed_cameras
+from mpmcli.scene.camera_file import CameraFile
+from mpmcli.scene.cameras import placed_cameras
 
 SPACING = 0.05
 DISTANCE = SPACING / 2

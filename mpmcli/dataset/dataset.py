@@ -126,7 +126,9 @@ class Trajectory(ABC):
         """Read some frames of all particles of an existing array."""
 
 
-class _StoredTrajectory(Trajectory):
+class StoredTrajectory(Trajectory):
+    """A trajectory in a shard."""
+
     def __init__(self, shard: Path, number: int) -> None:
         self._shard = shard
         with open_shard(shard) as file:
@@ -285,7 +287,7 @@ class Dataset:
             raise InputError(f"{self.path} has no trajectory {number}: it holds {held}.")
         if isinstance(self._source, Result):
             return (_PresentTrajectory if self._source.header.drops else _ResultTrajectory)(self._source)
-        return _StoredTrajectory(self._source[number], number)
+        return StoredTrajectory(self._source[number], number)
 
     @cached_property
     def frame_counts(self) -> dict[int, int]:

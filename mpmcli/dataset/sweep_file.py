@@ -3,6 +3,7 @@
 import copy
 import re
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path as File
 from typing import Any
@@ -11,9 +12,11 @@ import tomli_w
 from pydantic import ValidationError
 
 from mpmcli.dataset.draw import PlacementError, draw, template_extent
+from mpmcli.dataset.images import image_frames
 from mpmcli.dataset.sweep import ROUND_OFF, Placement, Sweep, SweepTable, is_number
 from mpmcli.errors import InputError
 from mpmcli.scene import Scene, parse_scene
+from mpmcli.scene.camera_file import valid_cameras
 from mpmcli.scene.load import read_scene, report, scene_problems
 from mpmcli.scene.material import Laws
 from mpmcli.scene.points import absence
@@ -51,15 +54,40 @@ def load_sweep(
         raise InputError(report(problems, str(path), text)) from None
     parse_scene(base_data, laws=laws, source=str(base), text=base_text, directory=base.parent)
     base_text = base_text or tomli_w.dumps(base_data)
-    same = {name: getattr(table, name) for name in ("count", "seed", "method", "accept", "vary", "split", "certify")}
+    same = {name: getattr(table, name) for name in SweepTable.model_fields if name not in ("base", "place")}
     sweep = Sweep(File(path), text, data, base, base_text, base_data, placements=table.place, **same)
     problems = list(_misplaced(sweep))
     if not problems:
         set_by, problems = _owners(sweep)
         problems = problems or _faulty_scenes(sweep, laws, set_by)
+    if not problems and sweep.images:
+        sweep = replace(sweep, cameras=_camera_tables(sweep, laws))
+        problems = list(_unseen(sweep, laws))
     if problems:
         raise InputError(report([_as_written(p, data) for p in problems], str(path), text))
     return sweep
+
+
+def _camera_tables(sweep: Sweep, laws: Laws) -> dict[str, Any] | None:
+    """Return the tables of the file of cameras, if there is one; InputError: they do not suit trajectory 0."""
+    if sweep.images.cameras is None:
+        return None
+    file, scene = sweep.path.parent / sweep.images.cameras, draw(sweep, 0).scene(laws).scene
+    text, tables = read_toml(file, "file of cameras")
+    valid_cameras(tables, scene.dimension, scene.constants, scene.time.end, str(file), text)
+    return tables
+
+
+def _unseen(sweep: Sweep, laws: Laws) -> Iterator[Problem]:
+    """Yield the problems of [images] in trajectory 0: no cameras, no frames."""
+    scene = draw(sweep, 0).scene(laws).scene
+    if sweep.cameras is None and not scene.cameras and scene.dimension == 3:
+        said = 'needs cameras: add [[cameras]] to the base scene, or name a file of cameras, cameras = "cameras.toml"'
+        yield Problem(("images",), said)
+    try:
+        image_frames(sweep, scene)
+    except InputError as error:
+        yield Problem(("images", "frames"), str(error).rstrip("."))
 
 
 def _base_file(path: File, text: str, data: dict[str, Any]) -> File:

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
 
 from mpmcli.errors import InputError
 from mpmcli.output.result import Result
@@ -31,10 +30,8 @@ from mpmcli.render.request import Request, require_sense
 from mpmcli.render.settings import USUAL_WHAT, WHAT, Settings, parse_limits
 from mpmcli.render.view import View, view_of_camera
 from mpmcli.render.window import choose_window
-from mpmcli.scene.cameras import Camera, CameraFile, PlacedCamera, camera_problems, placed_cameras
-from mpmcli.scene.entry import definitions
-from mpmcli.scene.load import report
-from mpmcli.scene.problem import problems_of
+from mpmcli.scene.camera_file import valid_cameras
+from mpmcli.scene.cameras import PlacedCamera, placed_cameras
 from mpmcli.scene.toml_file import read_toml
 
 DIRECTORY = "cameras"  # of the images in that of the result
@@ -111,27 +108,9 @@ def cameras_of(result: Result, given: Cameras = None) -> tuple[PlacedCamera, ...
         if not header.scene.cameras and result.dimension == 3:
             raise InputError(f"{result.path}: the scene has no cameras: add [[cameras]] to it, or give --cameras FILE.")
     source = str(given if isinstance(given, Path) else result.path)
-    cameras = valid_cameras(tables, result.dimension, header.scene.constants, header.end or 0.0, (source, text))
+    cameras = valid_cameras(tables, result.dimension, header.scene.constants, header.end or 0.0, source, text)
     scene = render_scene_of(result)
     return tuple(placed_cameras(cameras, scene.lower, scene.upper, scene.up))
-
-
-def valid_cameras(
-    tables: dict[str, Any], dimension: int, constants: Any, end: float, source: tuple[str, str]
-) -> tuple[Camera, ...]:
-    """Return the cameras of the tables of a file; InputError: they are faulty.
-
-    The scene has such constants, and ends at `end`, s. `source` is the name of the file and its text.
-    """
-    context = {"dimension": dimension, "constants": definitions(constants, dimension)[0]}
-    try:
-        cameras = CameraFile.model_validate(tables, context=context).cameras
-        problems = list(camera_problems(cameras, end))
-    except ValidationError as error:
-        problems = problems_of(error, tables, CameraFile)
-    if problems:
-        raise InputError(report(problems, *source))
-    return cameras
 
 
 def plan_images(
