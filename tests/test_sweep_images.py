@@ -3,13 +3,16 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 from command import run_here
 from good_sweep import BASE, LAWS, SWEEP, refusal, sweep_of
 from made_sweep import made_workers  # noqa: F401
+from PIL import Image
 from tiny_sweep import contents
 
 from mpmcli.dataset import images
+from mpmcli.dataset import open as open_dataset
 from mpmcli.dataset.draw import draw
 from mpmcli.dataset.merge import merge
 from mpmcli.dataset.report import verify
@@ -49,6 +52,7 @@ def test_images_are_the_same_however_the_sweep_was_computed(monkeypatch: pytest.
     truth = contents(made("whole"))
     # Number 4 is left out. Of 11 frames the last but two has a flow.
     assert {path.split("/")[1] for path in truth if path.startswith("images/")} == {f"{n:06d}" for n in (0, 1, 2, 3, 5)}
+    _check_reader(Path("whole"))
     found = sorted(path.removeprefix("images/000005/") for path in truth if "000005" in path)
     of_camera = [
         f"{what}_{number:06d}.{end}" for what, end in (("flow", "npz"), ("mask", "png")) for number in (0, 4, 8)
@@ -77,6 +81,33 @@ def test_images_are_the_same_however_the_sweep_was_computed(monkeypatch: pytest.
     assert contents(Path("merged")) == truth and verify(Path("merged")).faults == ()
 
 
+def _check_reader(path: Path) -> None:
+    """Masks are those of the files, the matrices put particles on their label, and what is not there is named."""
+    trajectory = open_dataset(path)[5]
+    cameras = trajectory.cameras
+    assert [*cameras] == ["near", "whole"] and cameras["near"].size == (32, 24)
+    whole, mask, flow = cameras["whole"], trajectory.images("whole", "mask"), trajectory.images("whole", "flow", [8, 0])
+    assert whole.frames.tolist() == [0, 4, 8] and whole.labels == {0: "background", 1: "pool", 2: "heap"}
+    np.testing.assert_array_equal(whole.times, trajectory.times[whole.frames])
+    assert (mask.shape, mask.dtype, flow.shape, flow.dtype) == ((3, 32, 32), np.uint8, (2, 32, 32, 2), np.float16)
+    assert np.array_equal(mask[1], np.array(Image.open(path / "images/000005/whole/mask_000004.png")))
+    points = np.pad(trajectory.position[4], [(0, 0), (0, 1)]) @ whole.world_to_camera[1, :3, :3].T
+    points += whole.world_to_camera[1, :3, 3]
+    column, row = np.floor((whole.K @ np.array([*points.T[:2], np.ones(len(points))]))[:2]).astype(int)
+    seen = mask[1, row, column]
+    # Dots are smaller than pixels, and the bodies overlap.
+    assert (seen > 0).mean() > 0.6 and (seen == trajectory.body + 1)[seen > 0].mean() > 0.7
+    for camera, what, frames, said in (
+        ("far", "mask", None, 'the images of trajectory 5 have no camera "far": give "near" or "whole".'),
+        ("near", "rgb", None, 'the images of trajectory 5 have no kind of image "rgb": give "mask" or "flow".'),
+        ("near", "mask", [4, 5], 'trajectory 5 has no "mask" of frame 5: it has those of frames [0, 4, 8].'),
+        ("near", "mask", [], 'trajectory 5 has no "mask" of no frame: it has those of frames [0, 4, 8].'),
+    ):
+        with pytest.raises(InputError) as refused:
+            trajectory.images(camera, what, frames)
+        assert str(refused.value) == said
+
+
 @pytest.mark.usefixtures("made_workers", "drawing")
 def test_only_what_is_missing_or_damaged_is_drawn_again(monkeypatch: pytest.MonkeyPatch) -> None:
     directory = made("d")
@@ -87,6 +118,14 @@ def test_only_what_is_missing_or_damaged_is_drawn_again(monkeypatch: pytest.Monk
     (changed / "cameras.json").write_text("{}", encoding="utf-8")
     # A killed worker leaves images without their checksums, and a file that has no name yet.
     (half / "checksums.sha256").unlink()
+    with pytest.raises(InputError, match=r"mask_000004.png is missing: make the images again"):
+        open_dataset(directory)[0].images("near", "mask")
+    with pytest.raises(InputError, match=r"cameras.json is damaged \(frames\): make the images again"):
+        open_dataset(directory)[2].images("near", "mask")
+    (half / "near" / "flow_000000.npz").write_bytes(b"PK")
+    with pytest.raises(InputError, match=r"flow_000000.npz is damaged .*: make the images again"):
+        open_dataset(directory)[3].images("near", "flow", [0])
+    (half / "near" / "flow_000000.npz").unlink()
     (half / "whole" / "mask_000008.png").rename(half / "whole" / "mask_000008.png.12345678.tmp")
     faults = verify(directory).faults
     assert [fault.partition(":")[0] for fault in faults] == [f"images of trajectory {n}" for n in (0, 2, 3)]

@@ -22,7 +22,7 @@ import numpy as np
 
 from mpmcli.dataset.certify import FIGURE, TITLE, certificates, error_of, error_section
 from mpmcli.dataset.folder import VERDICTS, Folder, Manifest, Row
-from mpmcli.dataset.images import image_faults
+from mpmcli.dataset.image_folder import image_faults
 from mpmcli.dataset.shard import (
     BASE,
     IMAGES,

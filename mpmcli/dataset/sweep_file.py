@@ -12,7 +12,7 @@ import tomli_w
 from pydantic import ValidationError
 
 from mpmcli.dataset.draw import PlacementError, draw, template_extent
-from mpmcli.dataset.images import image_frames
+from mpmcli.dataset.image_folder import image_frames
 from mpmcli.dataset.sweep import ROUND_OFF, Placement, Sweep, SweepTable, is_number
 from mpmcli.errors import InputError
 from mpmcli.scene import Scene, parse_scene

@@ -35,7 +35,8 @@ from mpmcli.dataset.folder import (
     source_files,
     standing_alone,
 )
-from mpmcli.dataset.images import ImageCost, image_cost, image_faults, image_frames, images_plan, remove_images
+from mpmcli.dataset.image_folder import image_faults, image_frames, images_plan, remove_images
+from mpmcli.dataset.images import ImageCost, image_cost
 from mpmcli.dataset.report import final_rows, remove_card, require_own_tables, write_card
 from mpmcli.dataset.shard import (
     BASE,

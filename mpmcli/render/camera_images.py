@@ -27,14 +27,13 @@ from mpmcli.render.picture_file import require_writable
 from mpmcli.render.pictures import LARGEST
 from mpmcli.render.render_scene import render_scene_of
 from mpmcli.render.request import Request, require_sense
-from mpmcli.render.settings import USUAL_WHAT, WHAT, Settings, parse_limits
+from mpmcli.render.settings import IMAGE_DIRECTORY, USUAL_WHAT, WHAT, Settings, parse_limits
 from mpmcli.render.view import View, view_of_camera
 from mpmcli.render.window import choose_window
 from mpmcli.scene.camera_file import valid_cameras
 from mpmcli.scene.cameras import PlacedCamera, placed_cameras
 from mpmcli.scene.toml_file import read_toml
 
-DIRECTORY = "cameras"  # of the images in that of the result
 # A file of cameras, or its tables; None for those of the scene.
 Cameras = Path | dict[str, Any] | None
 
@@ -93,7 +92,7 @@ def image_request(result: Result, request: Request, given: Cameras, what: str | 
         cmap=request.cmap,
         colliders="solid" if request.colliders == "auto" else request.colliders,
     )
-    directory = request.output or result.directory / DIRECTORY
+    directory = request.output or result.directory / IMAGE_DIRECTORY
     ks = choose_frames(request.frames or "all", result)
     return plan_images(result, ImageSettings(cameras, names, settings), ks, directory, overwrite=request.overwrite)
 

@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from mpmcli import __version__
+from mpmcli.errors import InputError
+from mpmcli.output.checksums import DAMAGE, first_line
 from mpmcli.output.durable import sealed, write_text
 from mpmcli.output.result import Result
 from mpmcli.render.picture_file import settings_digest, write_fault
@@ -17,6 +19,7 @@ from mpmcli.render.view import View, view_of_camera
 from mpmcli.render.visible import BACKGROUND, collider_label
 from mpmcli.scene.cameras import PlacedCamera
 
+_OF_FRAMES = {"frames": "number", "times": "time"}
 JSON, NERF = "cameras.json", "transforms.json"
 CONVENTION = (
     "A point X of the scene is at world_to_camera (X, 1) in the axes of the camera: x to the right, y down, z forward "
@@ -70,6 +73,72 @@ def write_image(path: Path, what: str, image: np.ndarray) -> None:
                     np.savez_compressed(file, **{what: image})
     except OSError as error:
         raise write_fault(path, error) from error
+
+
+def read_image(path: Path, what: str) -> np.ndarray:
+    """Read an image in the form of `ImagePainter.images`; InputError: it is missing or damaged."""
+    from PIL import Image
+
+    try:
+        if WHAT[what] == ".png":
+            with Image.open(path, formats=["PNG"]) as image:
+                return np.array(image)
+        with np.load(path) as file:
+            return file[what]
+    except FileNotFoundError:
+        raise InputError(f"{path} is missing: make the images again.") from None
+    # Pillow and zipfile raise almost any exception at a damaged file.
+    except Exception as error:
+        raise InputError(f"{path} is damaged ({first_line(error)}): make the images again.") from error
+
+
+@dataclass(frozen=True, eq=False)
+class CameraMatrices:
+    """Where a camera is in F frames, see CONVENTION.
+
+    Attributes:
+        K: (3, 3), pixels, of an orthographic camera pixels per metre.
+        world_to_camera: (F, 4, 4), lengths in m.
+        frames, times: (F,) their numbers, and times in s.
+        size: width and height, pixels; near, far: distances between which the domain lies, m.
+        model: "pinhole" or "orthographic".
+        labels: name of each value of a mask.
+    """
+
+    K: np.ndarray
+    world_to_camera: np.ndarray
+    frames: np.ndarray
+    times: np.ndarray
+    size: tuple[int, int]
+    near: float
+    far: float
+    model: str
+    labels: dict[int, str]
+
+
+def read_matrices(directory: Path) -> tuple[dict[str, CameraMatrices], list[str]]:
+    """Return the cameras of images by name, and what the images hold; InputError: there are none, or it is damaged."""
+    path = directory / JSON
+    if not path.is_file():
+        raise InputError(f"{directory} has no images: make them by [images] in a sweep, or by mpmcli render --cameras.")
+    try:
+        told = json.loads(path.read_text(encoding="utf-8"))
+        frames = {name: np.array([one[key] for one in told["frames"]]) for name, key in _OF_FRAMES.items()}
+        labels = {int(value): one["name"] for value, one in told["labels"].items()}
+        cameras = {
+            one["name"]: CameraMatrices(
+                K=np.array(one["K"]),
+                world_to_camera=np.array(one["world_to_camera"]),
+                size=(one["width"], one["height"]),
+                labels=labels,
+                **{name: one[name] for name in ("near", "far", "model")},
+                **frames,
+            )
+            for one in told["cameras"]
+        }
+        return cameras, list(told["what"])
+    except DAMAGE as error:
+        raise InputError(f"{path} is damaged ({first_line(error)}): make the images again.") from error
 
 
 def write_matrices(result: Result, asked: ImageSettings, ks: Sequence[int], directory: Path) -> None:
