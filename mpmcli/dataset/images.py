@@ -50,19 +50,22 @@ def image_cost(sweep: Sweep, laws: Laws) -> ImageCost:
 
     A start has no flow, which takes the space of a depth.
     """
-    from mpmcli.render.camera_images import image_request
+    from mpmcli.render.camera_images import ImageJob, image_request
     from mpmcli.render.render_scene import result_of_start
     from mpmcli.render.request import Request
+    from mpmcli.render.window import choose_window
 
+    choose_window()
     asked, taken = sweep.images, 0.0
     what = dict.fromkeys("depth" if name == "flow" else name for name in asked.what)
     with result_of_start(draw(sweep, 0).scene(laws).scene) as (start, _), TemporaryDirectory() as directory:
         request = Request(mode=asked.mode, output=Path(directory), overwrite=True)
         plan = image_request(start, request, sweep.cameras, ",".join(what))
-        # The first time libraries are loaded.
+        write = ImageJob(start, plan.asked, plan.directory).start()
+        # The first time libraries are loaded, and windows opened.
         for _ in range(2):
             began = time.perf_counter()
-            plan.carry_out(1)
+            write(0)
             taken = time.perf_counter() - began
         sizes = {name: sum(path.stat().st_size for path in Path(directory).glob(f"*/{name}_*")) for name in what}
     return ImageCost(sum(sizes["depth" if name == "flow" else name] for name in asked.what), taken, plan.notes)
