@@ -15,6 +15,7 @@ from drawn_results import JELLY, WATER, frame, header, lattice, write
 from PIL import Image
 from scipy.spatial import KDTree
 
+from mpmcli.dataset import open as open_dataset
 from mpmcli.errors import InputError
 from mpmcli.output import Result
 from mpmcli.render import reconstruction
@@ -212,6 +213,7 @@ def test_the_command_goes_on_and_refuses_other_images(tmp_path: Path) -> None:
     assert run.status == 0 and "3 frames from 1 camera" in run.stderr
     directory = result.directory / "cameras"
     assert run.stdout.strip() == str(directory)
+    assert open_dataset(result.directory)[0].images("camera", "mask").shape == (3, 256, 256)
     (directory / "camera" / "mask_000001.png").unlink()
     assert "1 frame from 1 camera" in run_here(*call).stderr
     call[4] = "depth"

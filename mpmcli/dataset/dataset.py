@@ -128,29 +128,18 @@ class Trajectory(ABC):
 
     @property
     def cameras(self) -> dict[str, "CameraMatrices"]:
-        """The cameras of the images by name, with their matrices, see `render/image_files.py: CameraMatrices`.
-
-        InputError: the trajectory has no images. Each access reads the file.
-        """
+        """The matrices of the cameras of the images by name; each access reads the file; InputError: there are none."""
         from mpmcli.render.image_files import read_matrices
 
         return read_matrices(self._image_directory)[0]
 
     def images(self, camera: str, what: str, frames: Iterable[int] | None = None) -> np.ndarray:
-        """Read images of a camera.
+        """Read images of one of `cameras`: "rgb", "depth", "mask", "flow" or "normal".
 
-        Args:
-            camera: one of `cameras`.
-            what: "rgb", "depth", "mask", "flow" or "normal".
-            frames: numbers of frames, of `cameras[camera].frames`; by default all of these with such an image, as the
-                last frame of a run has no flow.
-
-        Returns:
-            (F, h, w, 3) uint8 of "rgb"; (F, h, w) float32, m, of "depth", inf for nothing; (F, h, w) uint8 or uint16 of
-            "mask"; (F, h, w, 2) float16, pixels to the right and down, of "flow"; (F, h, w, 3) float16 of "normal".
-
-        Raises:
-            InputError: there is no such camera, image or frame, or a file is missing or damaged.
+        `frames` are F of the numbers `cameras[camera].frames`; by default all with such an image, as the last frame of
+        a run has no flow. rgb is (F, h, w, 3) uint8; depth (F, h, w) float32, m, inf for nothing; mask (F, h, w) uint8
+        or uint16; flow (F, h, w, 2) float16, pixels to the right and down; normal (F, h, w, 3) float16. InputError:
+        there is no such camera, image or frame, or a file is missing or damaged.
         """
         from mpmcli.render.image_files import file_of, read_image, read_matrices
 

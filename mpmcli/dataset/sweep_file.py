@@ -61,33 +61,28 @@ def load_sweep(
         set_by, problems = _owners(sweep)
         problems = problems or _faulty_scenes(sweep, laws, set_by)
     if not problems and sweep.images:
-        sweep = replace(sweep, cameras=_camera_tables(sweep, laws))
-        problems = list(_unseen(sweep, laws))
+        sweep, problems = _with_cameras(sweep, laws)
     if problems:
         raise InputError(report([_as_written(p, data) for p in problems], str(path), text))
     return sweep
 
 
-def _camera_tables(sweep: Sweep, laws: Laws) -> dict[str, Any] | None:
-    """Return the tables of the file of cameras, if there is one; InputError: they do not suit trajectory 0."""
-    if sweep.images.cameras is None:
-        return None
-    file, scene = sweep.path.parent / sweep.images.cameras, draw(sweep, 0).scene(laws).scene
-    text, tables = read_toml(file, "file of cameras")
-    valid_cameras(tables, scene.dimension, scene.constants, scene.time.end, str(file), text)
-    return tables
-
-
-def _unseen(sweep: Sweep, laws: Laws) -> Iterator[Problem]:
-    """Yield the problems of [images] in trajectory 0: no cameras, no frames."""
-    scene = draw(sweep, 0).scene(laws).scene
-    if sweep.cameras is None and not scene.cameras and scene.dimension == 3:
+def _with_cameras(sweep: Sweep, laws: Laws) -> tuple[Sweep, list[Problem]]:
+    """Return a sweep with its file of cameras, if any, and the problems of [images]; InputError: the file is faulty."""
+    scene, problems = draw(sweep, 0).scene(laws).scene, []
+    if sweep.images.cameras is not None:
+        file = sweep.path.parent / sweep.images.cameras
+        text, tables = read_toml(file, "file of cameras")
+        valid_cameras(tables, scene.dimension, scene.constants, scene.time.end, str(file), text)
+        sweep = replace(sweep, cameras=tables)
+    elif not scene.cameras and scene.dimension == 3:
         said = 'needs cameras: add [[cameras]] to the base scene, or name a file of cameras, cameras = "cameras.toml"'
-        yield Problem(("images",), said)
+        problems.append(Problem(("images",), said))
     try:
         image_frames(sweep, scene)
     except InputError as error:
-        yield Problem(("images", "frames"), str(error).rstrip("."))
+        problems.append(Problem(("images", "frames"), str(error).rstrip(".")))
+    return sweep, problems
 
 
 def _base_file(path: File, text: str, data: dict[str, Any]) -> File:

@@ -38,18 +38,7 @@ from mpmcli.dataset.folder import (
 from mpmcli.dataset.image_folder import image_faults, image_frames, images_plan, remove_images
 from mpmcli.dataset.images import ImageCost, image_cost
 from mpmcli.dataset.report import final_rows, remove_card, require_own_tables, write_card
-from mpmcli.dataset.shard import (
-    BASE,
-    CERTIFICATES,
-    IMAGES,
-    LABELS,
-    NUMBERED,
-    PENDING,
-    QUARANTINE,
-    SHARDS,
-    SWEEP,
-    file_name,
-)
+from mpmcli.dataset.shard import BASE, CERTIFICATES, LABELS, NUMBERED, PENDING, QUARANTINE, SHARDS, SWEEP, file_name
 from mpmcli.dataset.sweep import Sweep
 from mpmcli.errors import InputError, RunError
 from mpmcli.materials.registry import load_plugins
@@ -239,8 +228,7 @@ def open_folder(
     needed = size * folder.expected + SHARD_BYTES + SPACE_MARGIN
     free = shutil.disk_usage(next(p for p in (directory, *directory.resolve().parents) if p.exists())).free
     if replaces:
-        kept = (path for name in (SHARDS, QUARANTINE, IMAGES) for path in (directory / name).rglob("*.*"))
-        free += sum(path.stat().st_size for path in kept)
+        free += sum(path.stat().st_size for name in (SHARDS, QUARANTINE) for path in (directory / name).glob("*.h5"))
     if needed > free:
         raise InputError(
             f"the disk of {directory} has {size_text(free)} left, but the dataset needs about {size_text(needed)}: "
@@ -394,9 +382,9 @@ class _Run:
         state, missing = self.state, [n for n in self.folder.all_numbers() if n not in self.rows]
         chosen = {*certify_plan(self.sweep)["numbers"]} - certificates(self.folder.path)[0].keys()
         chosen &= {n for n in self.folder.all_numbers() if n not in self.rows or self.rows[n].accepted}
-        drawn = set(self.folder.all_numbers()) if self.sweep.images else set()
-        drawn -= {n for n, row in self.rows.items() if not row.accepted}
-        drawn -= self.rows.keys() - image_faults(self.folder.path, self.rows.values()).keys()
+        drawn: set[int] = set()
+        if self.sweep.images:
+            drawn = {*missing, *image_faults(self.folder.path, self.rows.values())}
         if not missing and not chosen and not drawn:
             return
         count = min(self.settings.processes, max(len(missing), len(chosen), len(drawn)))
@@ -487,10 +475,7 @@ class Rehearsed:
 
 @dataclass(frozen=True)
 class Rehearsal:
-    """Trajectories of a part, the number of workers, the splits without trajectories, and `plan_text` if certified.
-
-    `image_cost` is of the images of a frame, None without them.
-    """
+    """Trajectories of a part, number of workers, splits without any, `plan_text` if certified, and cost of images."""
 
     trajectories: tuple[Rehearsed, ...]
     workers: int
@@ -522,7 +507,7 @@ class Rehearsal:
     def as_dict(self) -> dict:
         """Return it for JSON."""
         whole = {"ok": self.passes, "trajectories": [vars(one) for one in self.trajectories], "bytes": self.bytes}
-        images = {f"image_{what}": self._images(what) for what in ("bytes", "seconds")} if self.image_cost else {}
+        images = {f"image_{what}": self._images(what) for what in ("bytes", "seconds")}
         return {**whole, "seconds": self.seconds, "workers": self.workers, "certify": self.plan, **images}
 
     def text(self) -> str:

@@ -19,7 +19,6 @@ from mpmcli.render.view import View, view_of_camera
 from mpmcli.render.visible import BACKGROUND, collider_label
 from mpmcli.scene.cameras import PlacedCamera
 
-_OF_FRAMES = {"frames": "number", "times": "time"}
 JSON, NERF = "cameras.json", "transforms.json"
 CONVENTION = (
     "A point X of the scene is at world_to_camera (X, 1) in the axes of the camera: x to the right, y down, z forward "
@@ -94,26 +93,17 @@ def read_image(path: Path, what: str) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class CameraMatrices:
-    """Where a camera is in F frames, see CONVENTION.
+    """Where a camera is in F frames, see CONVENTION; lengths in m."""
 
-    Attributes:
-        K: (3, 3), pixels, of an orthographic camera pixels per metre.
-        world_to_camera: (F, 4, 4), lengths in m.
-        frames, times: (F,) their numbers, and times in s.
-        size: width and height, pixels; near, far: distances between which the domain lies, m.
-        model: "pinhole" or "orthographic".
-        labels: name of each value of a mask.
-    """
-
-    K: np.ndarray
-    world_to_camera: np.ndarray
-    frames: np.ndarray
-    times: np.ndarray
-    size: tuple[int, int]
-    near: float
+    K: np.ndarray  # (3, 3), pixels; of an orthographic camera pixels per metre
+    world_to_camera: np.ndarray  # (F, 4, 4)
+    frames: np.ndarray  # (F,) their numbers
+    times: np.ndarray  # (F,), s
+    size: tuple[int, int]  # width and height, pixels
+    near: float  # distances between which the domain lies
     far: float
-    model: str
-    labels: dict[int, str]
+    model: str  # "pinhole" or "orthographic"
+    labels: dict[int, str]  # the name of each value of a mask
 
 
 def read_matrices(directory: Path) -> tuple[dict[str, CameraMatrices], list[str]]:
@@ -123,19 +113,13 @@ def read_matrices(directory: Path) -> tuple[dict[str, CameraMatrices], list[str]
         raise InputError(f"{directory} has no images: make them by [images] in a sweep, or by mpmcli render --cameras.")
     try:
         told = json.loads(path.read_text(encoding="utf-8"))
-        frames = {name: np.array([one[key] for one in told["frames"]]) for name, key in _OF_FRAMES.items()}
+        numbers, times = (np.array([one[key] for one in told["frames"]]) for key in ("number", "time"))
         labels = {int(value): one["name"] for value, one in told["labels"].items()}
-        cameras = {
-            one["name"]: CameraMatrices(
-                K=np.array(one["K"]),
-                world_to_camera=np.array(one["world_to_camera"]),
-                size=(one["width"], one["height"]),
-                labels=labels,
-                **{name: one[name] for name in ("near", "far", "model")},
-                **frames,
-            )
-            for one in told["cameras"]
-        }
+        cameras = {}
+        for one in told["cameras"]:
+            matrices, size = (np.array(one[name]) for name in ("K", "world_to_camera")), (one["width"], one["height"])
+            facts = size, one["near"], one["far"], one["model"], labels
+            cameras[one["name"]] = CameraMatrices(*matrices, numbers, times, *facts)
         return cameras, list(told["what"])
     except DAMAGE as error:
         raise InputError(f"{path} is damaged ({first_line(error)}): make the images again.") from error

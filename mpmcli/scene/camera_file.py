@@ -21,12 +21,9 @@ class CameraFile(Table):
 def valid_cameras(
     tables: dict[str, Any], dimension: int, constants: Any, end: float, source: str, text: str
 ) -> tuple[Camera, ...]:
-    """Return the cameras of the tables of a file for a scene; InputError: they are faulty.
+    """Return the cameras of the parsed tables of a file for a scene that ends at `end`, s; InputError: they are faulty.
 
-    Args:
-        tables: as TOML has them.
-        dimension, constants, end: of the scene; `end` in s.
-        source, text: name of the file, and its TOML text, for errors.
+    `source` is the name of the file, and `text` its TOML, for errors.
     """
     context = {"dimension": dimension, "constants": definitions(constants, dimension)[0]}
     try:
