@@ -16,6 +16,7 @@ from mpmcli.dataset.certify import write_certificate
 from mpmcli.dataset.compute import Task
 from mpmcli.dataset.draw import draw
 from mpmcli.dataset.folder import Row, program
+from mpmcli.dataset.images import draw_images
 from mpmcli.dataset.shard import PENDING, QUARANTINE, checksum, file_name, group_name, write_trajectory
 from mpmcli.dataset.sweep import Sweep
 from mpmcli.dataset.sweep_run import SweepSettings, run_sweep
@@ -88,7 +89,10 @@ class MadeWorkers:
                 raise KeyboardInterrupt
             if task.certified:
                 write_certificate(task.directory, made_certificate(task.certified.number))
-            yield task, [task.certified] if task.certified else [made_row(task, number) for number in task.numbers]
+            if task.imaged:
+                draw_images(task.directory, task.imaged, task.sweep)
+            kept = task.certified or task.imaged
+            yield task, [kept] if kept else [made_row(task, number) for number in task.numbers]
 
 
 @pytest.fixture

@@ -1,6 +1,8 @@
 """Images for training: an independent projector finds particles, depths and motions where the matrices say."""
 
 import json
+import signal
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -8,17 +10,20 @@ from typing import Any
 import numpy as np
 import pytest
 import tomli_w
-from command import run_here
+from command import run_here, started
 from drawn_results import JELLY, WATER, frame, header, lattice, write
 from PIL import Image
 from scipy.spatial import KDTree
 
+from mpmcli.dataset import open as open_dataset
 from mpmcli.errors import InputError
 from mpmcli.output import Result
 from mpmcli.render import reconstruction
 from mpmcli.render.camera_images import image_request
+from mpmcli.render.image_files import read_image
 from mpmcli.render.request import Request
-from mpmcli.scene.cameras import CameraFile, placed_cameras
+from mpmcli.scene.camera_file import CameraFile
+from mpmcli.scene.cameras import placed_cameras
 
 SPACING = 0.05
 DISTANCE = SPACING / 2
@@ -208,12 +213,49 @@ def test_the_command_goes_on_and_refuses_other_images(tmp_path: Path) -> None:
     assert run.status == 0 and "3 frames from 1 camera" in run.stderr
     directory = result.directory / "cameras"
     assert run.stdout.strip() == str(directory)
+    assert open_dataset(result.directory)[0].images("camera", "mask").shape == (3, 256, 256)
     (directory / "camera" / "mask_000001.png").unlink()
     assert "1 frame from 1 camera" in run_here(*call).stderr
     call[4] = "depth"
     refused = run_here(*call)
     assert refused.status == 2 and "has images of other cameras or settings" in refused.stderr
     assert run_here(*call, "--overwrite").status == 0
+
+
+@pytest.mark.usefixtures("drawing")
+@pytest.mark.parametrize("mode", ["dots", "surface"])
+def test_what_rests_looks_the_same_in_all_frames(tmp_path: Path, mode: str) -> None:
+    """The windows for colours and for masks share a process."""
+    points = lattice([0.1, 0.1], [0.5, 0.4], DISTANCE)
+    result = write(tmp_path, header([1.0, 1.0], SPACING, [JELLY]), [frame(k, points) for k in range(4)])
+    directory = images_of(result, [{"size": [64, 64]}], "rgb,mask", mode)
+    images = {path.read_bytes() for path in directory.glob("camera/rgb*")}
+    there = Projector(directory, 0, 3)
+    assert len(images) == 1 and (there.image("rgb")[there.image("mask") == 1] < 200).any(axis=1).mean() > 0.7
+
+
+@pytest.mark.usefixtures("drawing")
+def test_ctrl_c_leaves_whole_images(tmp_path: Path) -> None:
+    """In two workers; the same command goes on."""
+    points = lattice([0.1, 0.1], [0.5, 0.4], DISTANCE)
+    result = write(tmp_path / "r", header([1.0, 1.0], SPACING, [JELLY]), [frame(k, points) for k in range(150)])
+    directory = result.directory / "cameras"
+    with started(tmp_path, "render", "r", "--cameras", "--workers", "2") as process:
+        until = time.monotonic() + 120
+        while len(list(directory.glob("*/*.npz"))) < 8:
+            assert process.poll() is None and time.monotonic() < until, process.communicate()
+            time.sleep(0.02)
+        process.send_signal(signal.SIGINT)
+        stderr = process.communicate(timeout=120)[1]
+    assert process.returncode == 130 and stderr.splitlines()[-1] == "interrupted", stderr
+    there = {path: path.read_bytes() for path in directory.glob("*/*")}
+    assert {path.suffix for path in there} == {".png", ".npz"} and len(there) < 599
+    for path in there:
+        read_image(path, path.name.partition("_")[0])
+    run = run_here("render", result.directory, "--cameras", "--frame", "0:8", "--workers", "1")
+    assert run.status == 0 and all(path.read_bytes() == content for path, content in there.items())
+    told = json.loads((directory / "cameras.json").read_text(encoding="utf-8"))
+    assert len(told["frames"]) >= 8 and len(list(directory.glob("*/mask_*.png"))) >= 8
 
 
 @pytest.mark.parametrize(

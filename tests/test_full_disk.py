@@ -14,6 +14,7 @@ from command import ROOT, SCENE, run_here
 from scenes import slow
 
 from mpmcli.output import open_result
+from mpmcli.render.image_files import read_image
 
 # Each frame takes 14 kB.
 MANY = SCENE.replace("end = 0.05", "end = 0.5").replace("frames = 4", "frames = 40")
@@ -145,6 +146,21 @@ def test_an_export_above_the_limit_of_files_leaves_nothing(whole: Path, tmp_path
     outcome = run_limited(whole, 20_000, "export", "run", "--to", form, "-o", tmp_path / "exported")
     assert outcome.returncode == 1 and "File too large" in outcome.stderr, outcome.stderr
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("free", [4096, 300_000])
+def test_a_disk_that_fills_up_with_images(
+    whole: Path, small_disk: Callable[[int], Path], free: int, drawing: str
+) -> None:
+    """Those that are finished stay, and are whole."""
+    place = small_disk(free)
+    outcome = run_limited(whole, None, "render", "run", "--cameras", "--workers", "1", "-o", place / "images")
+    assert outcome.returncode == 1 and "Traceback" not in outcome.stderr
+    assert outcome.stderr.splitlines()[-1].startswith("error: ") and "free some space" in outcome.stderr
+    left = [path for path in place.glob("images/**/*.*") if path.name != "cameras.json"]
+    assert bool(left) == (free > 100_000)
+    for path in left:
+        read_image(path, path.name.partition("_")[0])
 
 
 @pytest.mark.slow

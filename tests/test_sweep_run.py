@@ -609,6 +609,20 @@ def test_a_rehearsal_tells_draws_disk_and_time(truth: Path, tmp_path: Path) -> N
     assert len(notes) == 2 and one.stdout.endswith("compilation apart\n")
 
 
+@pytest.mark.usefixtures("drawing")
+def test_workers_draw_images_of_trajectories_that_are_there(truth: Path, tmp_path: Path) -> None:
+    """Of a finished dataset, to which [images] is added; each particle is on the mask of its body."""
+    shutil.copytree(truth, tmp_path / "d")
+    sweep = tiny_sweep(tmp_path, more='images = { what = ["mask"], frames = "last" }\n')
+    state = run_sweep(sweep, SweepSettings(tmp_path / "d", workers=2, resume=True))
+    assert (state.status, state.kept, state.imaged) == ("finished", 12, 12) and verify(tmp_path / "d").faults == ()
+    for trajectory in open_dataset(tmp_path / "d"):
+        (mask,), camera = trajectory.images("camera", "mask"), trajectory.cameras["camera"]
+        x, y = (trajectory.position[-1] - 0.5).T * camera.K[0, 0]
+        assert (mask[(128 - y).astype(int), (128 + x).astype(int)] == trajectory.body + 1).mean() > 0.95
+    assert run_sweep(sweep, SweepSettings(tmp_path / "d", workers=2, resume=True)).imaged == 0
+
+
 POINTS = BASE.replace(
     "box = { min = [0.2, 0.0], max = [0.5, 0.3] }", 'points = { file = "grains.csv", spacing = 0.02 }'
 )

@@ -84,7 +84,8 @@ def sweep_command(
         def show(state: SweepState) -> None:
             text, more = f"{state.done - state.accepted} left out", ""
             text += f", {state.certified} certified" * bool(state.certified)
-            if state.steady:
+            text += f", images of {state.imaged}" * bool(state.imaged)
+            if state.steady and state.done < state.expected:
                 text += f", {state.per_hour:,.0f} per hour"
                 more = f", {duration_text((state.expected - state.done) / state.per_hour * 3600)} left"
             bar.show(state.done, text, more)

@@ -21,6 +21,7 @@ from mpmcli.check.scene_check import check_scene
 from mpmcli.dataset.certify import certify, write_certificate
 from mpmcli.dataset.draw import Draw, draw
 from mpmcli.dataset.folder import Row
+from mpmcli.dataset.images import draw_images
 from mpmcli.dataset.shard import LABELS, MOVING, PENDING, QUARANTINE, TrajectoryData, file_name, write_single
 from mpmcli.dataset.sweep import Sweep
 from mpmcli.errors import InputError, RunError
@@ -57,8 +58,8 @@ _SETTINGS = {
 class Task:
     """Trajectories of the dataset in a directory, for a worker with this backend and plugin laws from files.
 
-    sources: absolute path and digest of each file that scenes read. certified: the row of one trajectory in a shard,
-    for which a certificate is computed instead.
+    sources: absolute path and digest of each file that scenes read. certified, imaged: the row of one trajectory in a
+    shard, for which a certificate is computed, or whose images are drawn, instead.
     """
 
     directory: Path
@@ -69,6 +70,7 @@ class Task:
     plugins: tuple[Path, ...] = ()
     sources: tuple[tuple[Path, str], ...] = ()
     certified: Row | None = None
+    imaged: Row | None = None
 
 
 def compute(task: Task) -> list[Row]:
@@ -117,6 +119,9 @@ class _Trial:
 
 def _compute(task: Task) -> list[Row]:
     """Draw trajectories, run each until its verdict is accepted or no retry can change it, and store them."""
+    if row := task.imaged:
+        draw_images(task.directory, row, task.sweep)
+        return [row]
     began = time.perf_counter()
     # A missing backend ends the sweep, not only a trajectory.
     runner = _runner(task)

@@ -1,16 +1,28 @@
 """Reads a dataset: its trajectories by number, with arrays that are read on access, and windows of their frames."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mpmcli.dataset.folder import MANIFEST, Manifest
 from mpmcli.dataset.report import MOST_NAMED, status_of
-from mpmcli.dataset.shard import LABELS, MOVING, SHARDS, SPLITS, SWEEP, TABLES, StoredGroup, moving_names, open_shard
+from mpmcli.dataset.shard import (
+    IMAGES,
+    LABELS,
+    MOVING,
+    SHARDS,
+    SPLITS,
+    SWEEP,
+    TABLES,
+    StoredGroup,
+    group_name,
+    moving_names,
+    open_shard,
+)
 from mpmcli.errors import InputError
 from mpmcli.frames.frame import ACTIVE, RETIRED, STATUS, WAITING, Frame
 from mpmcli.frames.ledger import Ledger
@@ -20,8 +32,12 @@ from mpmcli.output.header import RunHeader
 from mpmcli.output.layout import PACKED, SEGMENTS, FrameLayout
 from mpmcli.output.run_record import RECORD
 from mpmcli.plain_text import counted
+from mpmcli.render.settings import IMAGE_DIRECTORY
 from mpmcli.scene.colliders import Collider
 from mpmcli.scene.problem import listed, quoted
+
+if TYPE_CHECKING:
+    from mpmcli.render.image_files import CameraMatrices
 
 Particles = slice | np.ndarray
 ALL = slice(None)
@@ -49,6 +65,7 @@ class Trajectory(ABC):
     frames: np.ndarray
     particle_count: int
     field_names: tuple[str, ...]
+    _image_directory: Path
 
     def __repr__(self) -> str:
         end = f"{self.times[-1]:.4g} s" if len(self.times) else "its start"
@@ -109,6 +126,35 @@ class Trajectory(ABC):
         array = self._read(name, frames)
         return array[particles] if name in LABELS else array[:, particles]
 
+    @property
+    def cameras(self) -> dict[str, "CameraMatrices"]:
+        """The matrices of the cameras of the images by name; each access reads the file; InputError: there are none."""
+        from mpmcli.render.image_files import read_matrices
+
+        return read_matrices(self._image_directory)[0]
+
+    def images(self, camera: str, what: str, frames: Iterable[int] | None = None) -> np.ndarray:
+        """Read images of one of `cameras`: "rgb", "depth", "mask", "flow" or "normal".
+
+        `frames` are F of the numbers `cameras[camera].frames`; by default all with such an image, as the last frame of
+        a run has no flow. rgb is (F, h, w, 3) uint8; depth (F, h, w) float32, m, inf for nothing; mask (F, h, w) uint8
+        or uint16; flow (F, h, w, 2) float16, pixels to the right and down; normal (F, h, w, 3) float16. InputError:
+        there is no such camera, image or frame, or a file is missing or damaged.
+        """
+        from mpmcli.render.image_files import file_of, read_image, read_matrices
+
+        cameras, held = read_matrices(self._image_directory)
+        for key, word, known in (("camera", camera, cameras), ("kind of image", what, held)):
+            if word not in known:
+                it = f"the images of trajectory {self.number}"
+                raise InputError(f'{it} have no {key} "{word}": give {listed(quoted(list(known)))}.')
+        there = [n for n in cameras[camera].frames.tolist() if what != "flow" or n != self.frames[-1]]
+        chosen = there if frames is None else list(frames)
+        if not chosen or not {*chosen} <= {*there}:
+            which = next((f"of frame {n}" for n in chosen if n not in there), "of no frame")
+            raise InputError(f'trajectory {self.number} has no "{what}" {which}: it has those of frames {there}.')
+        return np.stack([read_image(file_of(self._image_directory, camera, what, n), what) for n in chosen])
+
     def layout(self) -> FrameLayout:
         """Return names, types and shapes of the arrays of a frame."""
         first = slice(0, 1)
@@ -126,9 +172,12 @@ class Trajectory(ABC):
         """Read some frames of all particles of an existing array."""
 
 
-class _StoredTrajectory(Trajectory):
+class StoredTrajectory(Trajectory):
+    """A trajectory in a shard."""
+
     def __init__(self, shard: Path, number: int) -> None:
         self._shard = shard
+        self._image_directory = shard.parent.parent / IMAGES / group_name(number)
         with open_shard(shard) as file:
             stored = StoredGroup(file, number)
             self.number, self.split = number, str(stored.attribute("split"))
@@ -168,6 +217,7 @@ class _ResultTrajectory(Trajectory):
                     f"{result.path} lacks some of its frames: mpmcli simulate --resume computes them again."
                 )
         self._result = result
+        self._image_directory = result.directory / IMAGE_DIRECTORY
         self.number, self.split, self.draws = 0, SPLITS[0], {}
         self.header = result.header
         self.times, self.frames = result.times, result.numbers
@@ -285,7 +335,7 @@ class Dataset:
             raise InputError(f"{self.path} has no trajectory {number}: it holds {held}.")
         if isinstance(self._source, Result):
             return (_PresentTrajectory if self._source.header.drops else _ResultTrajectory)(self._source)
-        return _StoredTrajectory(self._source[number], number)
+        return StoredTrajectory(self._source[number], number)
 
     @cached_property
     def frame_counts(self) -> dict[int, int]:

@@ -24,6 +24,7 @@ from mpmcli.check.finding import Verdict
 from mpmcli.dataset.shard import (
     BASE,
     CERTIFICATES,
+    IMAGES,
     PENDING,
     QUARANTINE,
     SHARDS,
@@ -256,11 +257,11 @@ class Folder:
 
 FILE, PLUGIN = "file", "--plugin"
 # Names in a dataset that copied files cannot have.
-OWN = {SWEEP, BASE, SHARDS, PENDING, QUARANTINE, CERTIFICATES}
+OWN = {SWEEP, BASE, SHARDS, PENDING, QUARANTINE, CERTIFICATES, IMAGES}
 
 
 def source_files(sweep: Sweep, plugins: Sequence[Path]) -> dict[str, Path]:
-    """Return the absolute paths of existing files, by their names in the scenes, and `--plugin NAME`."""
+    """Return the absolute paths of existing files, by their names in scenes and sweep, and `--plugin NAME`."""
     names = set(_named(sweep.base_data))
     for key, distribution in sweep.distributions.items():
         for value in getattr(distribution, "values", ()):
@@ -270,6 +271,8 @@ def source_files(sweep: Sweep, plugins: Sequence[Path]) -> dict[str, Path]:
     for path in plugins:
         name = path.name if same[path.name] == 1 else f"{path.parent.name}/{path.name}"
         found[f"{PLUGIN} {name}"] = path.absolute()
+    if sweep.cameras:
+        found[sweep.images.cameras] = (sweep.path.parent / sweep.images.cameras).absolute()
     return {name: path for name, path in found.items() if path.is_file()}
 
 
@@ -287,13 +290,13 @@ def copied_files(names: Iterable[str]) -> list[str]:
     return [name for name in found if not Path(name).is_absolute() and not {"..", *OWN} & {*Path(name).parts}]
 
 
-def copy_sources(names: Iterable[str], origin: Path, directory: Path) -> None:
-    """Copy existing files to a dataset, from the directory of the base scene or from another dataset."""
-    for name in copied_files(names):
-        if (origin / name).is_file():
+def copy_sources(files: Mapping[str, Path], directory: Path) -> None:
+    """Copy existing files by name to a dataset."""
+    for name in copied_files(files):
+        if files[name].is_file():
             (directory / name).parent.mkdir(parents=True, exist_ok=True)
             with suppress(shutil.SameFileError):
-                shutil.copyfile(origin / name, directory / name)
+                shutil.copyfile(files[name], directory / name)
 
 
 def standing_alone(sweep: Sweep) -> str:

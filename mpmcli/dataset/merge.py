@@ -15,7 +15,7 @@ from mpmcli.dataset.folder import (
     require_same_program,
 )
 from mpmcli.dataset.report import CARD, Status, status_of, verify, write_card
-from mpmcli.dataset.shard import BASE, CERTIFICATES, QUARANTINE, SHARDS, SWEEP
+from mpmcli.dataset.shard import BASE, CERTIFICATES, IMAGES, QUARANTINE, SHARDS, SWEEP
 from mpmcli.errors import InputError
 from mpmcli.output.durable import require_free_space, sealed, write_text, writing
 from mpmcli.output.lock import take_lock
@@ -46,34 +46,33 @@ def merge(parts: Sequence[Path], target: Path) -> Status:
         if faults := verify(part).faults:
             raise InputError(f"{part} cannot be merged: {faults[0]}")
     manifest, told = Manifest(target), {**facts[0], "part": [1, 1]}
-    files = [
-        file
+    files = {
+        target / file.relative_to(part): file
         for part in parts
-        for folder, ending in ((SHARDS, "h5"), (QUARANTINE, "h5"), (CERTIFICATES, "json"))
-        for file in sorted((part / folder).glob(f"*.{ending}"))
-        if not (target / folder / file.name).exists()
-    ]
+        for names in (f"{SHARDS}/*.h5", f"{QUARANTINE}/*.h5", f"{CERTIFICATES}/*.json", f"{IMAGES}/*/**/*.*")
+        for file in sorted(part.glob(names))
+        if not (target / file.relative_to(part)).exists()
+    }
     if manifest.path.exists() and not files and (target / CARD).exists():
         require_empty(target)
     _require_target(manifest, told, rows)
     target.mkdir(parents=True, exist_ok=True)
     with take_lock(target):
         _require_target(manifest, told, rows, locked=True)
-        size = sum(file.stat().st_size for file in files)
+        size = sum(file.stat().st_size for file in files.values())
         require_free_space(target, size, "the merged dataset", "the parts are kept", several=True)
         # The manifest comes first, so that a killed merge is recognised by the files that it lacks.
         if not manifest.path.exists():
             manifest.create(told)
         manifest.put(rows)
         with writing(target, "the parts are kept"):
-            for file in files:
-                copy = target / file.parent.name / file.name
-                copy.parent.mkdir(exist_ok=True)
+            for copy, file in files.items():
+                copy.parent.mkdir(parents=True, exist_ok=True)
                 with sealed(copy, file.stat().st_size) as temporary:
                     shutil.copyfile(file, temporary)
             for name in (SWEEP, BASE):
                 write_text(target / name, (parts[0] / name).read_text(encoding="utf-8"))
-            copy_sources(facts[0].get("files", ()), parts[0], target)
+            copy_sources({name: parts[0] / name for name in facts[0].get("files", ())}, target)
         write_card(target)
     return status_of(target)
 

@@ -3,7 +3,6 @@
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -11,16 +10,13 @@ import numpy as np
 
 from mpmcli.dataset.dataset import Dataset, Trajectory, open_dataset
 from mpmcli.dataset.report import MONTAGE, number_text
+from mpmcli.dataset.trajectory_frames import TrajectoryFrames
 from mpmcli.errors import InputError
-from mpmcli.frames.ledger import Ledger
 from mpmcli.output.header import BodyHeader
-from mpmcli.output.layout import POSITION, STANDARD, FrameIndex, FrameLayout
-from mpmcli.output.result import Result
 from mpmcli.render.frame_choice import evenly_spaced
 from mpmcli.render.render_scene import appearance_of
 from mpmcli.render.request import RenderPlan, Request, plan_render
 from mpmcli.render.settings import parse_grid
-from mpmcli.scene.colliders import Collider
 
 
 def plan_montage(path: Path, request: Request) -> RenderPlan:
@@ -44,42 +40,24 @@ def plan_montage(path: Path, request: Request) -> RenderPlan:
     return replace(plan, notes=(dataset.lack,) if dataset.lack else ())
 
 
-class TrajectoryCells(Result):
+class TrajectoryCells(TrajectoryFrames):
     """One frame from each of several trajectories, as the frames of one run with the bodies of all.
 
-    They share camera, scale and colours. The domain is the box around all; fields are those common to all.
+    They share camera, scale and colours. The domain is the box around all.
     """
-
-    kind = "packed"
 
     def __init__(self, dataset: Dataset, numbers: Sequence[int], frame: str | None) -> None:
         """Choose the frame of each trajectory, and join their headers. Raises InputError if dimensions differ."""
-        self._trajectories = [dataset[number] for number in numbers]
-        self._chosen = [_position(frame, each) for each in self._trajectories]
-        headers = [each.header for each in self._trajectories]
+        trajectories = [dataset[number] for number in numbers]
+        headers = [each.header for each in trajectories]
         first = headers[0]
         if any(header.dimension != first.dimension or header.origin is None for header in headers):
             raise InputError(f"{dataset.path} has trajectories of 2 and 3 dimensions, or without a domain.")
+        super().__init__(dataset.path, [(each, _position(frame, each)) for each in trajectories], numbers)
         self._first_bodies = np.cumsum([0, *(len(header.bodies) for header in headers)])
-        self.captions = _captions(self._trajectories)
-        layouts = [each.layout() for each in self._trajectories]
-        names = dict.fromkeys((POSITION, *STANDARD, *layouts[0].arrays))
-        common = [name for name in names if all(name in each.arrays for each in layouts)]
-        pairs = list(zip(self._trajectories, self._chosen, strict=True))
-        times = np.array([each.times[k] for each, k in pairs])
-        index = FrameIndex(
-            FrameLayout(first.dimension, {name: layouts[0].arrays[name] for name in common}),
-            first.stored,
-            times,
-            np.array(numbers),
-            np.array([each.steps[k] for each, k in pairs]),
-            np.zeros(len(pairs), np.int64),
-            np.array([each.particle_count for each in self._trajectories]),
-            Ledger(each.ledger[k] for each, k in pairs),
-        )
-        super().__init__(dataset.path, index)
-        self.collider_frames = tuple(each.number for each in self._trajectories for _ in each.colliders)
-        title = f"{first.title}, t = {number_text(times[0])} s" if np.ptp(times) == 0 else first.title
+        self.captions = _captions(trajectories)
+        self.collider_frames = tuple(each.number for each in trajectories for _ in each.colliders)
+        title = f"{first.title}, t = {number_text(self.times[0])} s" if np.ptp(self.times) == 0 else first.title
         scenes = [header.stored.get("scene", "") for header in headers]
         alike: dict[str, Any] = {}
         bodies: list[BodyHeader] = []
@@ -101,25 +79,11 @@ class TrajectoryCells(Result):
             bodies=tuple(bodies),
         )
 
-    @cached_property
-    def colliders(self) -> tuple[Collider, ...]:
-        """The colliders of all trajectories."""
-        return tuple(collider for each in self._trajectories for collider in each.colliders)
-
     def _read(self, k: int, names: Sequence[str]) -> dict[str, np.ndarray]:
         """Return arrays of the frame of trajectory k, in which bodies are numbered through all trajectories."""
-        trajectory, frame = self._trajectories[k], self._chosen[k]
-        stored = {}
-        for name in names:
-            if name == "id":
-                array = np.arange(trajectory.particle_count)
-            elif name == "body":
-                array = trajectory.body + self._first_bodies[k].astype(np.int32)
-            elif name == "material":
-                array = trajectory.material
-            else:
-                array = trajectory.read("position" if name == POSITION else name, slice(frame, frame + 1))[0]
-            stored[name] = self.index.layout.arrays[name].pad(array)
+        stored = super()._read(k, names)
+        if "body" in stored:
+            stored["body"] = stored["body"] + self._first_bodies[k].astype(np.int32)
         return stored
 
 

@@ -12,6 +12,7 @@ from array import array
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -21,8 +22,10 @@ import numpy as np
 
 from mpmcli.dataset.certify import FIGURE, TITLE, certificates, error_of, error_section
 from mpmcli.dataset.folder import VERDICTS, Folder, Manifest, Row
+from mpmcli.dataset.image_folder import image_faults
 from mpmcli.dataset.shard import (
     BASE,
+    IMAGES,
     SHARDS,
     SPLITS,
     SWEEP,
@@ -162,6 +165,8 @@ def verify(path: Path, on_file: Callable[[int, int], None] = lambda done, total:
     wanted = {*Manifest(path).facts().get("certify", {}).get("numbers", ())} - certified.keys()
     lacking = [row.number for row in status.rows if row.accepted and row.number in wanted]
     faults += [*damaged, *(f"trajectory {n} has no certificate; mpmcli sweep --resume computes it." for n in lacking)]
+    if Manifest(path).facts().get("images"):
+        faults += chain.from_iterable(image_faults(path, status.rows).values())
     return Verification(path, sum(len(rows) for rows in by_file.values()), tuple(faults))
 
 
@@ -259,7 +264,7 @@ def write_card(directory: Path) -> Path:
         f"# {one_line(base.get('title') or 'Trajectories of particles')}",
         first_paragraph(sweep_text),
         "![Some of the trajectories](montage.png)" if (directory / MONTAGE).is_file() else "",
-        _contents(directory, included) if included else "No trajectory is included.",
+        _contents(directory, included) + _images(facts.get("images")) if included else "No trajectory is included.",
         _counts(facts["count"], rows),
         _left_out([row for row in rows if not row.accepted]),
         _drawn(sweep, rows),
@@ -398,6 +403,14 @@ def _contents(directory: Path, included: Sequence[Row]) -> str:
     if intervals:
         lines.insert(4, f"* interval between frames: {_range(intervals, 's')}")
     return "\n".join(lines)
+
+
+def _images(plan: Mapping[str, Any] | None) -> str:
+    """Return a line on the images of a dataset, "" if it has none."""
+    if not plan:
+        return ""
+    where = f"`{IMAGES}/{group_name(0)}/`, a directory for each camera; `cameras.json` has the matrices"
+    return f"\n* images: {', '.join(plan['what'])} of the frames {plan['frames']}, in {where}"
 
 
 def _counts(expected: int, rows: Sequence[Row]) -> str:

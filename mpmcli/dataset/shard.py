@@ -46,7 +46,7 @@ MOVING, LABELS, TABLES = ("position", "velocity"), ("body", "material"), ("time"
 LEDGER = "ledger"
 # The files of a dataset, and its directories.
 SWEEP, BASE = "sweep.toml", "base.toml"
-SHARDS, PENDING, QUARANTINE, CERTIFICATES = "shards", "pending", "quarantine", "certify"
+SHARDS, PENDING, QUARANTINE, CERTIFICATES, IMAGES = "shards", "pending", "quarantine", "certify", "images"
 NUMBERED = re.compile(r"\d{5,}\.h5")
 # Largest overhead of HDF5 for a data set and for a group, bytes.
 TABLE_BYTES, GROUP_BYTES = 1024, 16 * 1024

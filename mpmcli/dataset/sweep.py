@@ -13,6 +13,7 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field, PlainValidator, model_validator
 
+from mpmcli.render.settings import USUAL_WHAT, CameraMode, What
 from mpmcli.scene.problem import hint_at, listed, quoted, written
 from mpmcli.scene.quantity import AXES, LARGEST, Integer, NotNegative, Number, Table, flaw, list_of_axes
 
@@ -351,6 +352,25 @@ class Certify(Table):
     ] = 0.02
 
 
+class Images(Table):
+    """Which images for training are made of the accepted trajectories; see `mpmcli render --cameras`."""
+
+    cameras: Annotated[
+        str | None, Field(description="A file with [[cameras]], beside the sweep. Default: those of the scene.")
+    ] = None
+    what: Annotated[tuple[What, ...], Field(min_length=1, description="What images hold. Default: all but normal.")] = (
+        USUAL_WHAT
+    )
+    mode: Annotated[CameraMode, Field(description="Style of particles.")] = "dots"
+    frames: Annotated[str, Field(description="Frames, as --frame selects them: first, last, all, N or A:B:S.")] = "all"
+
+    @model_validator(mode="after")
+    def _surfaces_have_normals(self) -> "Images":
+        if self.mode == "dots" and "normal" in self.what:
+            raise flaw('"normal" is for surfaces, and dots have none; give mode = "surface"', "what")
+        return self
+
+
 class SweepTable(Table):
     """The keys of a sweep file."""
 
@@ -367,6 +387,9 @@ class SweepTable(Table):
     certify: Annotated[Certify | None, Field(description="Trajectories whose errors are measured. Default: none.")] = (
         None
     )
+    images: Annotated[Images | None, Field(description="Images for training of the trajectories. Default: none.")] = (
+        None
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -376,7 +399,8 @@ class Sweep:
     Attributes:
         path, text, data: the sweep file, its text, and its parsed TOML; base, base_text, base_data: the same of the
             base scene.
-        count, seed, method, accept, split, certify: as in the file; count may be replaced.
+        count, seed, method, accept, split, certify, images: as in the file; count may be replaced.
+        cameras: the tables of the file of cameras; None for those of the scene.
         vary: distributions by key of the base scene, in the order of the file.
         placements: bodies and colliders placed at random.
     """
@@ -395,12 +419,14 @@ class Sweep:
     placements: tuple[Placement, ...]
     split: Split
     certify: Certify | None
+    images: Images | None = None
+    cameras: dict[str, Any] | None = None
 
     @cached_property
     def key(self) -> str:
         """SHA-256, hexadecimal, of the base scene, the sweep and the count, independent of the layout of the files.
 
-        [certify] does not matter, as trajectories do not depend on it.
+        [certify] and [images] do not matter, as trajectories do not depend on them.
         The order of keys in [vary] and of [[place]] matters, because grids and Sobol components follow it.
         """
         vary, place = self.data.get("vary", {}), self.data.get("place", [])

@@ -3,6 +3,7 @@
 import copy
 import re
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path as File
 from typing import Any
@@ -11,9 +12,11 @@ import tomli_w
 from pydantic import ValidationError
 
 from mpmcli.dataset.draw import PlacementError, draw, template_extent
+from mpmcli.dataset.image_folder import image_frames
 from mpmcli.dataset.sweep import ROUND_OFF, Placement, Sweep, SweepTable, is_number
 from mpmcli.errors import InputError
 from mpmcli.scene import Scene, parse_scene
+from mpmcli.scene.camera_file import valid_cameras
 from mpmcli.scene.load import read_scene, report, scene_problems
 from mpmcli.scene.material import Laws
 from mpmcli.scene.points import absence
@@ -51,15 +54,35 @@ def load_sweep(
         raise InputError(report(problems, str(path), text)) from None
     parse_scene(base_data, laws=laws, source=str(base), text=base_text, directory=base.parent)
     base_text = base_text or tomli_w.dumps(base_data)
-    same = {name: getattr(table, name) for name in ("count", "seed", "method", "accept", "vary", "split", "certify")}
+    same = {name: getattr(table, name) for name in SweepTable.model_fields if name not in ("base", "place")}
     sweep = Sweep(File(path), text, data, base, base_text, base_data, placements=table.place, **same)
     problems = list(_misplaced(sweep))
     if not problems:
         set_by, problems = _owners(sweep)
         problems = problems or _faulty_scenes(sweep, laws, set_by)
+    if not problems and sweep.images:
+        sweep, problems = _with_cameras(sweep, laws)
     if problems:
         raise InputError(report([_as_written(p, data) for p in problems], str(path), text))
     return sweep
+
+
+def _with_cameras(sweep: Sweep, laws: Laws) -> tuple[Sweep, list[Problem]]:
+    """Return a sweep with its file of cameras, if any, and the problems of [images]; InputError: the file is faulty."""
+    scene, problems = draw(sweep, 0).scene(laws).scene, []
+    if sweep.images.cameras is not None:
+        file = sweep.path.parent / sweep.images.cameras
+        text, tables = read_toml(file, "file of cameras")
+        valid_cameras(tables, scene.dimension, scene.constants, scene.time.end, str(file), text)
+        sweep = replace(sweep, cameras=tables)
+    elif not scene.cameras and scene.dimension == 3:
+        said = 'needs cameras: add [[cameras]] to the base scene, or name a file of cameras, cameras = "cameras.toml"'
+        problems.append(Problem(("images",), said))
+    try:
+        image_frames(sweep, scene)
+    except InputError as error:
+        problems.append(Problem(("images", "frames"), str(error).rstrip(".")))
+    return sweep, problems
 
 
 def _base_file(path: File, text: str, data: dict[str, Any]) -> File:

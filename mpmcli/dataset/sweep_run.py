@@ -35,10 +35,12 @@ from mpmcli.dataset.folder import (
     source_files,
     standing_alone,
 )
+from mpmcli.dataset.image_folder import image_faults, image_frames, images_plan, remove_images
+from mpmcli.dataset.images import ImageCost, image_cost
 from mpmcli.dataset.report import final_rows, remove_card, require_own_tables, write_card
 from mpmcli.dataset.shard import BASE, CERTIFICATES, LABELS, NUMBERED, PENDING, QUARANTINE, SHARDS, SWEEP, file_name
 from mpmcli.dataset.sweep import Sweep
-from mpmcli.errors import InputError
+from mpmcli.errors import InputError, RunError
 from mpmcli.materials.registry import load_plugins
 from mpmcli.output.checksums import path_digest
 from mpmcli.output.durable import SPACE_MARGIN, remove_numbered, write_text
@@ -110,6 +112,7 @@ class SweepState:
     start_seconds: float = 0.0
     settled: tuple[int, float] | None = None
     certified: int = 0
+    imaged: int = 0
     status: str = "running"
 
     @property
@@ -139,7 +142,7 @@ class SweepState:
             "status": self.status,
             "directory": str(self.directory),
             "trajectories": self.expected,
-            **{name: getattr(self, name) for name in ("done", "kept", "accepted", "certified")},
+            **{name: getattr(self, name) for name in ("done", "kept", "accepted", "certified", "imaged")},
             "verdicts": {verdict: self.verdicts[verdict] for verdict in VERDICTS},
             **{name: getattr(self, name) for name in ("per_hour", "seconds", "start_seconds", "particle_steps")},
         }
@@ -176,17 +179,29 @@ def open_folder(
             )
         if (i, n) != settings.part:
             raise InputError(f"{directory} holds part {i}/{n} of the sweep; resume it with --shard {i}/{n}.")
-        now = source_digests(sweep, settings.plugins)
+        now, plan = source_digests(sweep, settings.plugins), images_plan(sweep)
+        if facts.get("images") not in (None, plan):
+            raise InputError(
+                f"{directory} has images of another [images] than the sweep: put that table back as it was, or give "
+                "another directory with -o."
+            )
         before = facts["files"]
+        if plan and "images" not in facts:
+            before = {name: digest for name, digest in now.items() if name == plan["cameras"]} | before
         if changed := sorted(name for name in {*before, *now} if before.get(name) != now.get(name)):
             raise InputError(
                 f"{changed[0]} has changed since {directory} was begun, which cannot be resumed with it: put it back "
                 "as it was, or give another directory with -o."
             )
         require_same_program(directory, facts, manifest.rows(), {**program(), "arch": settings.arch})
-        if sweep.certify:
+        if sweep.certify or sweep.images:
             write_text(directory / SWEEP, standing_alone(sweep))
+        if sweep.certify:
             manifest.tell("certify", certify_plan(sweep))
+        if plan:
+            copy_sources(source_files(sweep, ()), directory)
+            for name, told in (("images", plan), ("files", now)):
+                manifest.tell(name, told)
         return Folder(directory, sweep.count, facts["per_shard"], settings.part), manifest
     replaces = settings.overwrite and directory.is_dir() and any(path.name != LOCK for path in directory.iterdir())
     if replaces and not (directory / MANIFEST).exists():
@@ -205,6 +220,10 @@ def open_folder(
         i, n = settings.part
         shards = math.ceil(sweep.count / per_shard)
         raise InputError(f"--shard {i}/{n} is empty: {sweep.count} trajectories fill {counted(shards, 'shard')}.")
+    if sweep.images:
+        laws = load_plugins(settings.plugins)
+        frames = len(image_frames(sweep, draw(sweep, 0).scene(laws).scene))
+        size += image_cost(sweep, laws).bytes * frames
     # While a shard is sealed, its trajectories are on disk twice.
     needed = size * folder.expected + SHARD_BYTES + SPACE_MARGIN
     free = shutil.disk_usage(next(p for p in (directory, *directory.resolve().parents) if p.exists())).free
@@ -225,10 +244,11 @@ def open_folder(
         require_empty(directory, locked=True)
     facts = {"key": sweep.key, "count": sweep.count, "seed": sweep.seed, "accept": sweep.accept, "files": digests}
     facts |= {"certify": certify_plan(sweep)} if sweep.certify else {}
+    facts |= {"images": images_plan(sweep)} if sweep.images else {}
     for name, text in texts.items():
         write_text(directory / name, text)
     manifest.create({**facts, "per_shard": per_shard, "part": list(settings.part), **program()})
-    copy_sources(digests, sweep.base.parent, directory)
+    copy_sources(source_files(sweep, settings.plugins), directory)
     return folder, manifest
 
 
@@ -258,6 +278,7 @@ def _remove_trajectories(directory: Path, copied: Mapping[str, str], spared: Col
     for name in (PENDING, QUARANTINE, SHARDS):
         remove_numbered(directory / name, NUMBERED)
     remove_numbered(directory / CERTIFICATES, NAMES)
+    remove_images(directory)
     for name in copied_files(copied):
         path = directory / name
         if path.is_file() and path.resolve() not in spared and path_digest(path) == copied[name]:
@@ -357,13 +378,16 @@ class _Run:
         on_progress: Callable[[SweepState], None],
         stop: Callable[[], bool],
     ) -> None:
-        """Compute trajectories without a row, then certificates; `began` is when the sweep began, s."""
+        """Compute trajectories without a row, then certificates and images; `began` is when the sweep began, s."""
         state, missing = self.state, [n for n in self.folder.all_numbers() if n not in self.rows]
         chosen = {*certify_plan(self.sweep)["numbers"]} - certificates(self.folder.path)[0].keys()
         chosen &= {n for n in self.folder.all_numbers() if n not in self.rows or self.rows[n].accepted}
-        if not missing and not chosen:
+        drawn: set[int] = set()
+        if self.sweep.images:
+            drawn = {*missing, *image_faults(self.folder.path, self.rows.values())}
+        if not missing and not chosen and not drawn:
             return
-        count = min(self.settings.processes, max(len(missing), len(chosen)))
+        count = min(self.settings.processes, max(len(missing), len(chosen), len(drawn)))
         with nullcontext(joined) if joined else local_workers(count) as workers:
             since = time.perf_counter()
             state.start_seconds = since - began
@@ -374,13 +398,21 @@ class _Run:
                 if ended == workers.count:
                     state.settled = state.done, state.seconds
                 on_progress(state)
-            # The largest first: the device is allocated once.
-            rows = sorted((self.rows[n] for n in chosen if self.rows[n].accepted), key=lambda row: -row.particles)
-            tasks = _tasks(self.sweep, self.settings, [row.number for row in rows], max(1, len(rows)))
-            tasks = [replace(task, certified=row) for task, row in zip(tasks, rows, strict=True)]
-            for _, found in workers.outcomes(tasks, stop):
+            for _, found in workers.outcomes(self._later_tasks(chosen, "certified"), stop):
                 state.certified += found is not None
                 on_progress(state)
+            for task, found in workers.outcomes(self._later_tasks(drawn, "imaged"), stop):
+                if found is None:
+                    raise RunError(f"The images of trajectory {task.numbers[0]} could not be drawn: {LOST}")
+                state.imaged += 1
+                on_progress(state)
+
+    def _later_tasks(self, numbers: Collection[int], key: str) -> list[Task]:
+        """Return a task for each included trajectory of some, with its row as `key` of the task."""
+        # The largest first: the device is allocated once.
+        rows = sorted((self.rows[n] for n in numbers if self.rows[n].accepted), key=lambda row: -row.particles)
+        tasks = _tasks(self.sweep, self.settings, [row.number for row in rows], max(1, len(rows)))
+        return [replace(task, **{key: row}) for task, row in zip(tasks, rows, strict=True)]
 
     def take(self, rows: Sequence[Row]) -> None:
         self._put(rows)
@@ -426,7 +458,7 @@ class Rehearsed:
     """One trajectory: values by key, counts, bytes without compression, seconds, and its fault, if any.
 
     Seconds are those of one thread from the table of costs, 0 if the trajectory cannot be computed; `certify_seconds`
-    those of its siblings, 0 if it has none.
+    those of its siblings, 0 if it has none; `image_frames` the number of frames with images.
     """
 
     number: int
@@ -438,16 +470,18 @@ class Rehearsed:
     seconds: float
     fault: str
     certify_seconds: float = 0.0
+    image_frames: int = 0
 
 
 @dataclass(frozen=True)
 class Rehearsal:
-    """Trajectories of a part, the number of workers, the splits without trajectories, and `plan_text` if certified."""
+    """Trajectories of a part, number of workers, splits without any, `plan_text` if certified, and cost of images."""
 
     trajectories: tuple[Rehearsed, ...]
     workers: int
     empty: tuple[str, ...] = ()
     plan: str = ""
+    image_cost: ImageCost | None = None
 
     @property
     def passes(self) -> bool:
@@ -456,18 +490,25 @@ class Rehearsal:
 
     @property
     def bytes(self) -> int:
-        """Bytes of the dataset without compression."""
-        return sum(one.bytes for one in self.trajectories)
+        """Bytes of the dataset, its shards without compression."""
+        return round(sum(one.bytes for one in self.trajectories) + self._images("bytes"))
+
+    def _images(self, what: str) -> float:
+        """Return the bytes, or the seconds of one worker, of all images."""
+        of_one = getattr(self.image_cost, what, 0.0)
+        return of_one * sum(one.image_frames for one in self.trajectories)
 
     @property
     def seconds(self) -> float | None:
         """Expected wall time, None if no trajectory can be computed."""
-        return sum(one.seconds + one.certify_seconds for one in self.trajectories) / self.workers or None
+        computed = sum(one.seconds + one.certify_seconds for one in self.trajectories)
+        return (computed + self._images("seconds")) / self.workers or None
 
     def as_dict(self) -> dict:
         """Return it for JSON."""
         whole = {"ok": self.passes, "trajectories": [vars(one) for one in self.trajectories], "bytes": self.bytes}
-        return {**whole, "seconds": self.seconds, "workers": self.workers, "certify": self.plan}
+        images = {f"image_{what}": self._images(what) for what in ("bytes", "seconds")}
+        return {**whole, "seconds": self.seconds, "workers": self.workers, "certify": self.plan, **images}
 
     def text(self) -> str:
         """Return it as text: the first draws, the faults, and the forecast."""
@@ -495,6 +536,11 @@ class Rehearsal:
             numbers = ", ".join(str(one.number) for one in self.trajectories if one.certify_seconds) or "none here"
             share = f"about {duration_text(more)}, {more / (every or 1.0):.0%} of the time of the trajectories"
             lines.append(f"certify: {self.plan}: {numbers}; {share}")
+        if self.image_cost:
+            lines += [f"note: {note}" for note in self.image_cost.notes]
+            frames, size = sum(one.image_frames for one in self.trajectories), size_text(self._images("bytes"))
+            each = duration_text(self._images("seconds") / self.workers)
+            lines.append(f"images: of {counted(frames, 'frame')}, {size}, about {each} in the workers")
         lines.append(f"{total}: {size_text(self.bytes)}{time_text} with {workers}, compilation apart")
         return "\n".join(lines)
 
@@ -504,9 +550,9 @@ def rehearse(sweep: Sweep, settings: SweepSettings) -> Rehearsal:
     laws = load_plugins(settings.plugins)
     per_shard = _per_shard(_bytes_of_trajectories(sweep, settings))
     folder = Folder(settings.directory, sweep.count, per_shard, settings.part)
-    found, plan = [], certify_plan(sweep)
+    found, plan, cost = [], certify_plan(sweep), image_cost(sweep, laws) if sweep.images else None
     for number in folder.all_numbers():
-        values, fault, counts = {}, "", (0, 0, 0, 0.0)
+        values, fault, counts, frames = {}, "", (0, 0, 0, 0.0), 0
         try:
             drawn = draw(sweep, number)
             values = drawn.values
@@ -515,14 +561,15 @@ def rehearse(sweep: Sweep, settings: SweepSettings) -> Rehearsal:
             steps = expected_steps(SceneFacts(loaded.scene))
             seconds = 0.0 if fault else seconds_of_one(loaded.scene, steps)
             counts = particles, steps, trajectory_bytes(loaded.scene, particles), seconds
+            frames = len(image_frames(sweep, loaded.scene)) if cost else 0
         except InputError as error:
             fault = str(error)
         siblings = counts[-1] * cost_of_one(sweep) if number in plan["numbers"] else 0.0
-        found.append(Rehearsed(number, sweep.split_of(number), values, *counts, fault, siblings))
+        found.append(Rehearsed(number, sweep.split_of(number), values, *counts, fault, siblings, frames))
     used = {sweep.split_of(number) for number in range(min(sweep.count, SURE))}
     empty = tuple(name for name, share in sweep.split if share > 0 and name not in used)
     text = plan_text(sweep.count, **plan) if sweep.certify else ""
-    return Rehearsal(tuple(found), settings.processes, empty, text)
+    return Rehearsal(tuple(found), settings.processes, empty, text, cost)
 
 
 def _short(value: Any) -> str:

@@ -12,28 +12,32 @@ HINT = "give a number, first, last, all, or A:B:S, from A up to but not B in ste
 
 
 def choose_frames(text: str, result: Result) -> list[int]:
-    """Return the indices in the result of the frames selected by a text, in the selected order.
+    """Return the indices in the result of the frames that --frame selects, see `frames_in`."""
+    return frames_in(text, result.numbers.tolist(), _holds(result))
 
-    The text is "first", "last", "all", N or "A:B:S". N is a frame number; a negative one counts back from the last
-    number (-1). A:B:S is a Python slice of the frames of the result, by position.
+
+def frames_in(text: str, numbers: Sequence[int], holds: str, option: str = "--frame ") -> list[int]:
+    """Return the indices of the frames selected by a text, in the selected order; InputError: there is none.
+
+    The text is "first", "last", "all", N or "A:B:S". N is one of the frame numbers; a negative one counts back from the
+    last number (-1). A:B:S is a Python slice of the frames, by position. Errors say what `holds` which frames.
     """
-    count = result.frame_count
-    numbers = result.numbers.tolist()
+    count = len(numbers)
     word = text.strip()
     if word in ("first", "last", "all"):
         return {"first": [0], "last": [count - 1], "all": list(range(count))}[word]
     if re.fullmatch(r"-?\d+", word):
         wanted = int(word) if int(word) >= 0 else int(word) + numbers[-1] + 1
         if wanted not in numbers:
-            raise InputError(f"--frame {word}: {_holds(result)}.")
+            raise InputError(f"{option}{word}: {holds}.")
         return [numbers.index(wanted)]
     match = re.fullmatch(r"(-?\d+)?:(-?\d+)?(?::(-?\d+)?)?", word)
     start, end, step = (int(part) if part else None for part in match.groups()) if match else (0, 0, 0)
     if step == 0:
-        raise InputError(f'--frame "{text}" selects no frame: {HINT}.')
+        raise InputError(f'{option}"{text}" selects no frame: {HINT}.')
     chosen = list(range(count))[start:end:step]
     if not chosen:
-        raise InputError(f"--frame {word} selects no frame: {_holds(result)}.")
+        raise InputError(f"{option}{word} selects no frame: {holds}.")
     return chosen
 
 

@@ -30,7 +30,7 @@ def lights_of(scene: RenderScene, view: View, theme: Theme) -> dict[str, np.ndar
 
     One lamp is over the left shoulder, one behind, one at the side.
     """
-    right, up, back = (view.lit or view).axes
+    right, up, back = (view.lamps or view).axes
     above = np.array(scene.up)
     dark = theme.name == "dark"
     return {

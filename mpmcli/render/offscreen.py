@@ -38,8 +38,8 @@ class OffscreenRenderer:
         view.place(self.plotter)
 
     def add_box(self, scene: RenderScene, width: float = 1.5) -> None:
-        """Draw the edges of the domain except the three in front, which would cross its contents; see `View.lit`."""
-        if self.view.lit:
+        """Draw the edges of the domain except the three in front, which would cross its contents."""
+        if not self.view.edges:
             return
         import pyvista as pv
 
@@ -68,10 +68,10 @@ class OffscreenRenderer:
         """Add a light above and to the left of the camera; for several cameras one in the scene, and one opposite."""
         import pyvista as pv
 
-        lit = self.view.lit
-        for place, intensity in ((LAMP, 1.0), (LAMP * [-1.0, 1.0, -1.0], 0.6))[: 2 if lit else 1]:
-            light = pv.Light(light_type="scene light" if lit else "camera light", intensity=intensity)
-            light.position, light.focal_point = tuple(place @ lit.axes if lit else place), (0.0, 0.0, 0.0)
+        lamps = self.view.lamps
+        for place, intensity in ((LAMP, 1.0), (LAMP * [-1.0, 1.0, -1.0], 0.6))[: 2 if lamps else 1]:
+            light = pv.Light(light_type="scene light" if lamps else "camera light", intensity=intensity)
+            light.position, light.focal_point = tuple(place @ lamps.axes if lamps else place), (0.0, 0.0, 0.0)
             self.plotter.add_light(light)
 
     def render(self) -> None:

@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from mpmcli.errors import InputError, RunError
@@ -106,7 +108,7 @@ def reconstruct(
     raw = np.asarray(mesh.vertices)
     vertices = np.clip(raw, low, high)
     kept = _area_vectors(vertices, triangles).any(axis=1)
-    kept &= ~_pressed_flat(raw, triangles, particles, low, high)
+    kept &= ~_pressed_flat(raw, triangles, particles, low, high) & _inside(raw, triangles, low, high)
     triangles = triangles[kept]
     return Mesh(
         points=(vertices * radius + middle).astype(np.float32),
@@ -169,6 +171,15 @@ def _pressed_flat(
             middles = vertices[triangles[rows]].mean(axis=1)[:, others]
             flat[rows] |= np.isinf(KDTree(close).query(middles, distance_upper_bound=CONTACT)[0])
     return flat
+
+
+def _inside(raw: np.ndarray, triangles: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Return which triangles (t,) belong to a surface with a vertex in the domain; the others are of images alone."""
+    edges = triangles[:, [0, 1, 1, 2]].reshape(-1, 2).T
+    graph = coo_array((np.ones(edges.shape[1], bool), edges), (len(raw), len(raw)))
+    count, surface = connected_components(graph, directed=False)
+    inside = np.bincount(surface, ((raw >= low) & (raw <= high)).all(axis=1), count) > 0
+    return inside[surface[triangles[:, 0]]]
 
 
 def _fullness(points: np.ndarray, vertices: np.ndarray) -> np.ndarray:

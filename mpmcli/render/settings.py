@@ -9,6 +9,12 @@ from mpmcli.errors import InputError
 
 Mode = Literal["dots", "surface", "fluid", "density"]
 MODES: tuple[Mode, ...] = ("dots", "surface", "fluid", "density")
+# What an image for training may hold, and the endings of its files; what they hold by default, and what cameras see.
+What = Literal["rgb", "depth", "mask", "flow", "normal"]
+WHAT: dict[What, str] = {"rgb": ".png", "depth": ".npz", "mask": ".png", "flow": ".npz", "normal": ".npz"}
+USUAL_WHAT: tuple[What, ...] = ("rgb", "depth", "mask", "flow")
+CameraMode = Literal["dots", "surface", "fluid"]
+IMAGE_DIRECTORY = "cameras"  # of images for training, in the directory of a result
 Colliders = Literal["auto", "solid", "clear", "none"]
 COLLIDERS: tuple[Colliders, ...] = ("auto", "solid", "clear", "none")
 # A place, m, a vector there relative to the longest of its kind, each (d,), and its magnitude with the unit.

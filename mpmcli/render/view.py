@@ -36,9 +36,8 @@ class View:
     parallel: bool  # parallel projection, for which a scale bar is valid
     near: float  # distances from the camera between which the domain lies, m
     far: float
-    lit: "View | None" = (
-        None  # the view whose lamps are used, so that several cameras see the same light; None: its own
-    )
+    lamps: "View | None" = None  # the view whose lamps are used; None: its own
+    edges: bool = True  # whether the edges of the domain are drawn in 3D
 
     @property
     def distance(self) -> float:
@@ -211,7 +210,7 @@ def _free_view(scene: RenderScene, camera: str, size: tuple[int, int]) -> View:
 
 
 def view_of_camera(scene: RenderScene, camera: PlacedCamera, time: float) -> View:
-    """Return the view of a camera of a scene at a time, s, lit as from "iso"; InputError: position is target."""
+    """Return the view of a camera of a scene at a time, s, with the lamps of "iso"; InputError: position is target."""
     position, focus = camera.pose(time)
     back, up = position - focus, np.array(camera.up)
     distance = float(np.linalg.norm(back))
@@ -219,7 +218,7 @@ def view_of_camera(scene: RenderScene, camera: PlacedCamera, time: float) -> Vie
         raise InputError(f'camera "{camera.name}" is at its target at {time:.4g} s: move one of them.')
     height = camera.height if camera.focal is None else camera.size[1] / camera.focal * distance
     view = _view(scene, camera.size, (position, focus, _upright(back, up)), height, parallel=camera.focal is None)
-    return replace(view, lit=view_of(scene, "iso", camera.size))
+    return replace(view, lamps=view_of(scene, "iso", camera.size), edges=False)
 
 
 def _upright(back: np.ndarray, up: np.ndarray) -> np.ndarray:

@@ -215,6 +215,8 @@ class PrimitiveWindow:
 
     def _set(self, primitives: Sequence[Primitives]) -> None:
         """Replace what the window shows."""
+        # VTK frees the buffers of what is removed in the current window, in which others may have the same numbers.
+        self._window.plotter.render_window.MakeCurrent()
         self._window.plotter.renderer.RemoveAllViewProps()
         self._primitives, first = primitives, 1
         for one in primitives:

@@ -198,9 +198,3 @@ def _placed(camera: Camera, lower: np.ndarray, upper: np.ndarray, up: np.ndarray
             radius = math.sqrt(several.radius**2 - rise**2)
         away = radius * (math.cos(angle) * across + math.sin(angle) * beside) + rise * up
         yield PlacedCamera(**{**common, "name": f"{camera.name}_{k}"}, offset=tuple(away.tolist()))
-
-
-class CameraFile(Table):
-    """The tables of a file of cameras."""
-
-    cameras: tuple[Camera, ...] = Field(min_length=1, description="Cameras.")
