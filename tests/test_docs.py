@@ -60,7 +60,7 @@ SHORTER = {
 # scripts/test is what runs this test.
 NOT_RUN = {"scripts/test"}
 # These are run with -m slow: kernels in f64, the report of a GPU, and what other files test (test_bench.py,
-# test_docs_datasets.py, test_validate_cli.py, test_warm.py).
+# test_docs_datasets.py, test_score.py, test_validate_cli.py, test_warm.py).
 SLOW = {
     "mpmcli bench > results/bench.txt",
     "mpmcli bench --dataset > results/dataset.txt",
@@ -70,6 +70,7 @@ SLOW = {
     "mpmcli validate bar_fixed_free --levels coarse -o results/bar",
     "mpmcli validate conservation --levels coarse",
     "mpmcli warm configs/dam_break_2d.toml",
+    "mpmcli score results/drops --baseline -o results/score.svg",
     "scripts/gpu --arch cpu --parts runs --out results/gpu",
     "mpmcli simulate drop.toml -o results/series --set time.frames=4 --format vtk --precision f64 --quiet --json "
     "> series.json",

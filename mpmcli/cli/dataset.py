@@ -1,4 +1,4 @@
-"""`mpmcli sweep`, `mpmcli dataset` and `mpmcli export`."""
+"""`mpmcli sweep`, `mpmcli dataset`, `mpmcli export` and `mpmcli score`."""
 
 import math
 import time
@@ -252,3 +252,42 @@ def export_command(dataset: Path, quiet: bool, as_json: bool, **given: Any) -> N
         for note in summary.notes:
             print_note(f"note: {note}")
     print_answer(summary, as_json, quiet=quiet)
+
+
+@click.command("score", epilog="Example: mpmcli score datasets/drops --rollouts rollouts.npz")
+@click.argument("dataset", type=PATH)
+@click.option("--rollouts", type=PATH, metavar="FILE", help="Predicted positions, .npz or HDF5.")
+@click.option("--baseline", is_flag=True, help="Score the solver beside them, on coarser grids, with its seconds.")
+@options.output_option("With --baseline, a figure of error against seconds, .svg.", "FILE", "figure")
+@options.arch_option("Backend of the solver")
+@quiet_option
+@json_option
+def score_command(
+    dataset: Path, rollouts: Path | None, baseline: bool, figure: Path | None, arch: Any, quiet: bool, as_json: bool
+) -> None:
+    """Score predicted trajectories against those of DATASET, or of the result of one run, by horizon.
+
+    FILE has an array (frames, particles, d), m, for each trajectory, named by its number. With --baseline alone the
+    solver computes the first trajectories of the test split again.
+    """
+    from mpmcli.dataset.dataset import open_dataset
+    from mpmcli.dataset.score import read_rollouts, score_rollouts
+
+    if rollouts is None and not baseline:
+        raise click.UsageError("there is nothing to score: give --rollouts FILE, --baseline, or both.")
+    if figure is not None and (not baseline or figure.suffix != ".svg" or figure.exists()):
+        raise click.UsageError(f"-o {figure} has to be a new file for the figure of --baseline, such as score.svg.")
+    opened = open_dataset(dataset)
+    predicted = read_rollouts(rollouts, opened) if rollouts else []
+    if not baseline:
+        print_answer(score_rollouts(opened, predicted), as_json)
+        return
+    from mpmcli.cli.progress import ProgressBar
+    from mpmcli.dataset.baseline import RATIOS, chosen, compare
+
+    numbers = [one.number for one in predicted] or chosen(opened)
+    with ProgressBar(len(RATIOS) * len(numbers), "runs", quiet=quiet) as bar:
+        compared = compare(opened, numbers, predicted, arch, bar.show)
+    if figure:
+        compared.draw(figure)
+    print_answer(compared, as_json, quiet=quiet)

@@ -32,6 +32,7 @@ GROUPS = {
         "sweep": ("dataset", "Compute a dataset of many varied runs."),
         "dataset": ("dataset", "Count, verify and merge datasets."),
         "export": ("dataset", "Write a dataset or a result for learning, NumPy or ParaView."),
+        "score": ("dataset", "Score predicted trajectories against those of a dataset."),
     },
     "Trust": {
         "validate": ("validate", "Measure speed against error on problems with known answers."),

@@ -145,14 +145,18 @@ def certify(scene: Scene, folder: Path, laws: Laws, shard: Path, number: int, ru
 def _siblings(tables: dict[str, Any], reach: Reach) -> Iterator[tuple[Sibling | LeftOut, bool]]:
     """Yield the siblings, and whether each has the particles of the scene."""
     yield coarser(tables, reach, RATIOS[0]), False
-    coarse, d = coarser(tables, reach, RATIOS[1]), len(tables["domain"]["size"])
-    if isinstance(coarse, Sibling):
-        for body in coarse.tables.get("bodies", []):
-            if "points" not in body["shape"]:
-                body["particles_per_cell"] = round(body["particles_per_cell"] ** (1 / d) * coarse.ratio) ** d
-        coarse = replace(coarse, name=f"{coarse.name}, same particles")
-    yield coarse, True
+    coarse = coarser(tables, reach, RATIOS[1])
+    yield with_same_particles(coarse) if isinstance(coarse, Sibling) else coarse, True
     yield nudged(tables), True
+
+
+def with_same_particles(coarse: Sibling) -> Sibling:
+    """Return a scene on a coarser grid, whose tables are changed, for the particles of the scene."""
+    d = len(coarse.tables["domain"]["size"])
+    for body in coarse.tables.get("bodies", []):
+        if "points" not in body["shape"]:
+            body["particles_per_cell"] = round(body["particles_per_cell"] ** (1 / d) * coarse.ratio) ** d
+    return replace(coarse, name=f"{coarse.name}, same particles")
 
 
 def _stored(shard: Path, number: int) -> tuple[RunHeader, list[Frame], Any]:
