@@ -22,6 +22,7 @@ import numpy as np
 
 from mpmcli.dataset.certify import FIGURE, TITLE, certificates, error_of, error_section
 from mpmcli.dataset.folder import VERDICTS, Folder, Manifest, Row
+from mpmcli.dataset.hold_out import rules_text
 from mpmcli.dataset.image_folder import image_faults
 from mpmcli.dataset.shard import (
     BASE,
@@ -266,6 +267,7 @@ def write_card(directory: Path) -> Path:
         "![Some of the trajectories](montage.png)" if (directory / MONTAGE).is_file() else "",
         _contents(directory, included) + _images(facts.get("images")) if included else "No trajectory is included.",
         _counts(facts["count"], rows),
+        rules_text(facts.get("hold_out", {}), [(json.loads(row.draws), row.particles) for row in included]),
         _left_out([row for row in rows if not row.accepted]),
         _drawn(sweep, rows),
         error_section(directory, facts["count"], plan, error) if plan else "",
