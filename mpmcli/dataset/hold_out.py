@@ -49,7 +49,9 @@ def _value(draws: Mapping[str, Any], key: str, particles: int | None) -> Any:
 
 def rules_text(rules: Rules, trajectories: Sequence[tuple[Mapping[str, Any], int]]) -> str:
     """Return the rules in words, and how many of the given draws and numbers of particles meet each; "" without any."""
-    lines = ["The first of these rules that a trajectory meets decides its split; train has none that meets one:\n"]
+    lines = [
+        "The first of these rules that a trajectory meets decides its split; fractions decide those of all others:\n"
+    ]
     for split, rule in ((split, rule) for split, its in rules.items() for rule in its):
         said = []
         for key, given in rule.items():

@@ -61,11 +61,11 @@ def load_sweep(
     base_text = base_text or tomli_w.dumps(base_data)
     same = {name: getattr(table, name) for name in SweepTable.model_fields if name not in ("base", "place")}
     sweep = Sweep(File(path), text, data, base, base_text, base_data, placements=table.place, **same)
-    problems = list(_misplaced(sweep))
+    problems = [*_misplaced(sweep), *_misheld(sweep)]
     if not problems:
         set_by, problems = _owners(sweep)
         problems = problems or _faulty_scenes(sweep, laws, set_by)
-    problems = problems or _misheld(sweep, laws)
+    problems = problems or _emptied(sweep, laws)
     if not problems and sweep.images:
         sweep, problems = _with_cameras(sweep, laws)
     if problems:
@@ -116,8 +116,8 @@ def _as_written(problem: Problem, data: dict[str, Any]) -> Problem:
     return problem
 
 
-def _misheld(sweep: Sweep, laws: Laws) -> list[Problem]:
-    """Find keys and values that no split can hold out, and rules that hold out nothing or everything."""
+def _misheld(sweep: Sweep) -> Iterator[Problem]:
+    """Find keys and values that no split can hold out."""
     ends: dict[str, list[Any]] = {PARTICLES: [0, LARGEST]}
     for key, one in sweep.drawn_once.items():
         values = one.extremes()
@@ -125,19 +125,18 @@ def _misheld(sweep: Sweep, laws: Laws) -> list[Problem]:
             ends |= {f"{key}.{k}": list(both) for k, both in enumerate(zip(*values, strict=True))}
         elif len(values) > 1:
             ends[key] = values
-    found = []
     for split, rules in sweep.split.rules.items():
         for k, rule in enumerate(rules):
             for key, given in rule.items():
                 if said := _not_held(key, given, ends):
-                    found.append(Problem(("split", split, k, key), said))
-    return found or _emptied(sweep, laws)
+                    yield Problem(("split", split, k, key), said)
 
 
 def _not_held(key: str, given: object, ends: dict[str, list[Any]]) -> str:
     """Return why a condition of a rule is wrong, by the values at the ends of each key, or all; "" if it is right."""
     if key not in ends:
-        return f"no key that varies; {hint_at(key, list(ends), f'those are {several(quoted(list(ends)))}')}"
+        parts = [known for known in ends if known.startswith(f"{key}.")]
+        return f"no key that varies; {hint_at(key, parts[:1] or [*ends], f'those are {several(quoted([*ends]))}')}"
     drawn = ends[key]
     if not all(map(is_number, drawn)):
         if not isinstance(given, list) or not given or not all(one in drawn for one in given):
