@@ -1,13 +1,14 @@
 """Splits by rule: what they hold out, that no path to a dataset changes it, and what card, metadata and audit say."""
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import made_sweep
 import pytest
-from command import run_here
+from command import ROOT, run_here
 from good_sweep import BASE, SWEEP, refusal, sweep_of
 from made_sweep import made_workers, make_dataset  # noqa: F401
 
@@ -141,6 +142,18 @@ def test_choices_and_components_are_held_out():
     speeds = [sweep.values_of(n)["bodies.stone.velocity"][0] for n in range(100)]
     assert splits(sweep) == ["valid" if v >= 1.5 else "test" if v >= 1 else "train" for v in speeds]
     assert sweep.key != sweep_of(of_varied('[split.valid]\n"bodies.stone.velocity.0" = [1.5, 2.0]\n')).key
+
+
+def test_the_rules_of_the_page_are_right():
+    """In the sweep of the page, with the base scene of README.md."""
+    page, readme = ((ROOT / name).read_text(encoding="utf-8") for name in ("docs/datasets.md", "README.md"))
+    (scene,) = re.findall(r"^```toml\n(.*?)^```$", readme, re.MULTILINE | re.DOTALL)
+    drops, rules, *_ = re.findall(r"^```toml\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
+    sweep = sweep_of(drops[: drops.index("[split]")].replace("drop.toml", "base.toml") + rules, scene)
+    for n in range(100):
+        viscosity, gravity, balls = (sweep.values_of(n)[key] for key in ("bodies.pool.material.viscosity", GRAVITY,
+                                                                         "place.ball.count"))  # fmt: skip
+        assert (sweep.split_of(n) == "test") == (viscosity >= 0.3 or (gravity == -3.7 and balls == 2))
 
 
 BAD = {
