@@ -55,11 +55,8 @@ def rules_text(rules: Rules, trajectories: Sequence[tuple[Mapping[str, Any], int
     for split, rule in ((split, rule) for split, its in rules.items() for rule in its):
         said = []
         for key, given in rule.items():
-            some = (
-                f"from {given[0]:.12g} to {given[1]:.12g}"
-                if is_range(given)
-                else listed([written(one) for one in given])
-            )
+            values = listed([written(one) for one in given])
+            some = f"from {given[0]:.12g} to {given[1]:.12g}" if is_range(given) else values
             said.append(f"`{key}` {some}")
         count = sum(meets(rule, *one) for one in trajectories)
         lines.append(f"* {split}: {' and '.join(said)}: {counted(count, 'trajectory')} included")
