@@ -36,6 +36,7 @@ def made_row(task: Task, number: int) -> Row:
     """Write the made-up frames of a trajectory where a worker would, and return its row."""
     drawn, verdict = draw(task.sweep, number), VERDICTS.get(number, "stable")
     accepted = verdict == "stable"
+    drawn = replace(drawn, split=task.sweep.split_of(number, 20 + number))
     data = made_trajectory(number, particles=20 + number, split=drawn.split)
     data = replace(data, draws=drawn.values)
     file = f"{PENDING if accepted else QUARANTINE}/{file_name(number)}"

@@ -593,6 +593,21 @@ def test_a_copied_file_takes_no_place(of_points: Sweep) -> None:
     assert copy.read_text(encoding="utf-8") == "x,y\n0.3,0.3\n"
 
 
+def test_a_rule_on_particles_is_of_those_that_a_run_has(truth: Path, tmp_path: Path) -> None:
+    """Of the trajectories with the fewest and the most particles, the second is held out, in row and file."""
+    counts = {row.particles: row.number for row in told(truth)}
+    numbers = [counts[min(counts)], counts[max(counts)]]
+    rule = f"[split]\ntrain = 1\n[split.test]\nparticles = [{max(counts)}, {max(counts)}]\n"
+    path = write_sweep(tmp_path)
+    path.write_text(path.read_text(encoding="utf-8") + rule, encoding="utf-8")
+    sweep = load_sweep(path, laws=parameter_models())
+    rows = [row for task in _tasks(sweep, SweepSettings(tmp_path / "d"), numbers, 1) for row in compute(task)]
+    assert [(row.particles, row.split) for row in rows] == [(min(counts), "train"), (max(counts), "test")]
+    for row in rows:
+        with h5py.File(tmp_path / "d" / row.file) as file:
+            assert file[f"{row.number:06d}"].attrs["split"] == row.split
+
+
 def test_a_rehearsal_tells_draws_disk_and_time(truth: Path, tmp_path: Path) -> None:
     """Its bytes are those of the dataset, within what headers take, and its draws those that come."""
     outcome = run_here("sweep", write_sweep(tmp_path), "--dry-run", "--json", "-o", tmp_path / "d")

@@ -5,6 +5,7 @@ mean of n of them one of 2 eps / sqrt(n). Frames lie `dt` apart to within a step
 differences depend by less than a thousandth.
 """
 
+import json
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -18,6 +19,7 @@ import numpy as np
 
 from mpmcli.dataset.certify import STD_LEAST
 from mpmcli.dataset.exported import trajectories
+from mpmcli.dataset.hold_out import held_in
 from mpmcli.dataset.metadata import EXPORTED_BY
 from mpmcli.dataset.shard import SPLITS
 from mpmcli.frames.frame import ACTIVE
@@ -306,6 +308,7 @@ class Seen:
     def __init__(self, one: Exported) -> None:
         """Compute moments, hashes and fingerprint of an exported trajectory."""
         self.name, self.split, self.size = one.name, one.split, one.v.size
+        self.draws, self.particles = one.own.get("draws", {}), one.own.get("particles")
         self.moments = [f(a, axis=(0, 1)) for a in (one.v, np.diff(one.v, axis=0)) for f in (np.nanmean, np.nanvar)]
         self.hashes = {hash(frame.tobytes()) for frame in one.arrays["position"][1:]}
         # Neither signs nor the order of particles matter: a mirror image has the same.
@@ -363,13 +366,19 @@ class Audit:
                 yield None, None, f"{key} is {self.meta[key]}; the training split has {values[0][0].tolist()}."
 
     def splits(self) -> Findings:
-        """Splits have the stated numbers of trajectories."""
+        """Splits have the stated numbers of trajectories, and those with rules what meets them, and nothing else."""
         stated = {split: self.meta[f"num_trajs_{split}"] for split in SPLITS if f"num_trajs_{split}" in self.meta}
         if not stated:
             raise AbsentError("metadata.json does not state num_trajs_train")
         for split, right in stated.items():
             if (count := sum(one.split == split for one in self.seen)) != right:
                 yield None, count, f"{split} has {counted(count, 'trajectory')}; metadata.json states {right}."
+        rules = self.meta.get("hold_out", {})
+        for one in self.seen:
+            held = held_in(rules, one.draws, one.particles)
+            if held != one.split and (held or one.split in rules):
+                told = f"by the rules of hold_out it is {f'of {held}' if held else 'not'}."
+                yield None, None, f"{one.name} is of {one.split}; {told}"
 
     def duplicates(self, across: bool = False) -> Findings:
         """No trajectory is in its split twice, nearly, mirrored, or with half of its frames."""
@@ -389,8 +398,15 @@ class Audit:
             yield None, shared[i, j], f"{seen[j].name} of {seen[j].split} is {seen[i].name} of {seen[i].split}: {same}."
 
     def leakage(self) -> Findings:
-        """No trajectory is in two splits, nearly, mirrored, or with half of its frames."""
-        return self.duplicates(across=True)
+        """No trajectory is in two splits, nearly, mirrored, or with half of its frames; nor draws held out."""
+        yield from self.duplicates(across=True)
+        rules, trained = self.meta.get("hold_out", {}), {}
+        for one in sorted(self.seen, key=lambda one: one.split != "train") if rules else ():
+            draws = json.loads(json.dumps(one.draws, sort_keys=True), parse_float=lambda text: f"{float(text):.4g}")
+            if one.split == "train":
+                trained[json.dumps(draws)] = one.name
+            elif one.split in rules and (other := trained.get(json.dumps(draws))):
+                yield None, None, f"{one.name} of {one.split} has the draws of {other} of train to four digits."
 
     @property
     def findings(self) -> int:

@@ -201,6 +201,7 @@ def _with_step(scene: Scene, factor: float) -> Scene:
 def _stored(task: Task, row: Row, drawn: Draw, scene: Scene, run: Recording, retries: int, accepted: bool) -> Row:
     """Write the frames of a run, if there are any, and return its row."""
     backend = run.header.backend
+    drawn = replace(drawn, split=task.sweep.split_of(row.number, run.particles))
     file = checksum = ""
     if run.frames:
         folder = PENDING if accepted else QUARANTINE
@@ -211,6 +212,7 @@ def _stored(task: Task, row: Row, drawn: Draw, scene: Scene, run: Recording, ret
         file = f"{folder}/{path.name}"
     facts = {name: getattr(run, name) for name in ("verdict", "reason", "steps", "particles")}
     facts |= {"arch": backend["arch"], "precision": backend["precision"], "file": file, "checksum": checksum}
+    facts["split"] = drawn.split
     digest = hashlib.sha256(scene_to_toml(scene).encode()).hexdigest()
     return replace(row, scene=digest, accepted=int(accepted), retries=retries, frames=len(run.frames), **facts)
 

@@ -263,7 +263,7 @@ def _obstacles(
 
 @dataclass(frozen=True, eq=False)
 class Draw:
-    """One trajectory of a sweep, of the `split` "train", "valid" or "test".
+    """One trajectory of a sweep, of the `split` "train", "valid" or "test" if rules on its particles do not matter.
 
     `values` are the drawn values as JSON: of each key of [vary], and under `place.NAME` (`place.colliders.NAME`) lists
     of placed `{name, min, max}` or `{name, center, radius}`, with `velocity` if drawn. `data` is the parsed TOML with

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from mpmcli.dataset.dataset import Dataset
-from mpmcli.dataset.folder import MANIFEST
+from mpmcli.dataset.folder import MANIFEST, Manifest
 from mpmcli.dataset.formats import FORMATS, format_named
 from mpmcli.dataset.metadata import EXPORTED_BY, common_facts
 from mpmcli.dataset.report import status_of
@@ -122,6 +122,9 @@ def export(
         lack, told = status.lack(), status.as_dict()
         taken = {*numbers}
         metadata["verdict"] = {group_name(row.number): row.verdict for row in status.rows if row.number in taken}
+        if rules := Manifest(dataset.path).facts().get("hold_out"):
+            counts = {group_name(row.number): row.particles for row in status.rows if row.number in taken}
+            metadata |= {"hold_out": rules, "particles": counts}
         metadata["dataset"] = {name: told[name] for name in ("part", "trajectories", "done", "accepted", "verdicts")}
     if any(each.particle_count < each.source.particle_count for each in chosen):
         metadata["particle_seed"] = SEED

@@ -22,6 +22,7 @@ import numpy as np
 
 from mpmcli.dataset.certify import FIGURE, TITLE, certificates, error_of, error_section
 from mpmcli.dataset.folder import VERDICTS, Folder, Manifest, Row
+from mpmcli.dataset.hold_out import Rules, rules_text
 from mpmcli.dataset.image_folder import image_faults
 from mpmcli.dataset.shard import (
     BASE,
@@ -266,8 +267,9 @@ def write_card(directory: Path) -> Path:
         "![Some of the trajectories](montage.png)" if (directory / MONTAGE).is_file() else "",
         _contents(directory, included) + _images(facts.get("images")) if included else "No trajectory is included.",
         _counts(facts["count"], rows),
+        rules_text(facts.get("hold_out", {}), [(json.loads(row.draws), row.particles) for row in included]),
         _left_out([row for row in rows if not row.accepted]),
-        _drawn(sweep, rows),
+        _drawn(sweep, rows, facts.get("hold_out", {})),
         error_section(directory, facts["count"], plan, error) if plan else "",
         loading,
         f"Drawn with seed {facts['seed']}; computed with mpmcli {facts['version']}. `sweep.toml` and `base.toml` are "
@@ -440,18 +442,20 @@ def _left_out(rows: Sequence[Row]) -> str:
     return "\n".join(["Left out:", "", *lines])
 
 
-def _drawn(sweep: Mapping[str, Any], rows: Sequence[Row]) -> str:
+def _drawn(sweep: Mapping[str, Any], rows: Sequence[Row], rules: Rules) -> str:
     """Return a table of the varying keys, and of the values drawn, with a line for each key that decides who is in."""
     components: dict[str, DrawnComponent] = {}
     for row in rows:
         for label, source, value in values_of(sweep, json.loads(row.draws)):
-            components.setdefault(label, DrawnComponent(label, source)).add(value, row.accepted)
+            components.setdefault(label, DrawnComponent(label, source)).add(value, row.accepted, row.split in rules)
     if not components or not any(row.accepted for row in rows):
         return ""
     head = ("key", "drawn from", "min", "mean", "max", "values")
     # What was left out has a column if there is any.
     head += ("left out",) * (not all(row.accepted for row in rows))
     told = [(f"`{one.label}`", one.source, *one.row[2 : len(head)]) for one in components.values()]
+    if rules:
+        head, told = (*head, "held out"), [(*its, one.held) for its, one in zip(told, components.values(), strict=True)]
     method = sweep.get("method", "random")
     lines = [
         f"## What varies\n\nWhat the included trajectories have drawn (method: {method}); a histogram has ten bins "
@@ -513,16 +517,17 @@ class DrawnComponent:
 
     def __init__(self, label: str, source: str) -> None:
         self.label, self.source = label, source
-        # Of the trajectories left out, and of those included.
-        self._numbers = array("d"), array("d")
-        self._texts: tuple[Counter[str], Counter[str]] = Counter(), Counter()
+        # Of the trajectories left out, of those included, and of those included that a split holds out.
+        self._numbers = array("d"), array("d"), array("d")
+        self._texts: tuple[Counter[str], ...] = Counter(), Counter(), Counter()
 
-    def add(self, value: Any, accepted: bool = True) -> None:
+    def add(self, value: Any, accepted: bool = True, held: bool = False) -> None:
         """Count a value, a finite number or any other JSON value, of a trajectory that is included or left out."""
-        if isinstance(value, int | float) and not isinstance(value, bool):
-            self._numbers[accepted].append(value)
-        else:
-            self._texts[accepted][value if isinstance(value, str) else json.dumps(value)] += 1
+        for group in (accepted, 2) if accepted and held else (accepted,):
+            if isinstance(value, int | float) and not isinstance(value, bool):
+                self._numbers[group].append(value)
+            else:
+                self._texts[group][value if isinstance(value, str) else json.dumps(value)] += 1
 
     @property
     def row(self) -> tuple[str, ...]:
@@ -534,20 +539,25 @@ class DrawnComponent:
             ends = (number_text(min(numbers)), number_text(mean), number_text(max(numbers)))
         return (self.label, self.source, *ends, self._distribution(True), self._distribution(False))
 
-    def _distribution(self, accepted: bool) -> str:
+    @property
+    def held(self) -> str:
+        """Distribution of the values that splits hold out, in the bins of all."""
+        return self._distribution(2)
+
+    def _distribution(self, group: int) -> str:
         drawn = [*self._numbers[True], *self._numbers[False]]
         # Sorted as numbers; a key that draws texts has few distinct ones.
         distinct = len({*map(number_text, drawn), *self._texts[True], *self._texts[False]})
         if (distinct <= MOST_COUNTED and distinct < max(len(drawn), 2)) or any(self._texts):
-            counts = Counter(map(number_text, sorted(self._numbers[accepted]))) + self._texts[accepted]
+            counts = Counter(map(number_text, sorted(self._numbers[group]))) + self._texts[group]
             told = [f"{value}: {count}" for value, count in list(counts.items())[:MOST_COUNTED]]
             return ", ".join([*told, "..."] if len(counts) > MOST_COUNTED else told)
-        numbers = self._numbers[accepted]
+        numbers = self._numbers[group]
         return f"`{histogram(numbers, min(drawn), max(drawn))}`" if numbers else ""
 
     def truncation(self) -> str:
         """Return a sentence if the values left out rank otherwise than those included (Mann and Whitney), else ""."""
-        gone, kept = self._numbers
+        gone, kept, _ = self._numbers
         if not gone or not kept or any(self._texts):
             return ""
         from scipy.stats import mannwhitneyu

@@ -11,8 +11,9 @@ from statistics import NormalDist
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from pydantic import Field, PlainValidator, model_validator
+from pydantic import Field, PlainValidator, ValidatorFunctionWrapHandler, WrapValidator, model_validator
 
+from mpmcli.dataset.hold_out import Rules, held_in
 from mpmcli.render.settings import USUAL_WHAT, CameraMode, What
 from mpmcli.scene.problem import hint_at, listed, quoted, written
 from mpmcli.scene.quantity import AXES, LARGEST, Integer, NotNegative, Number, Table, flaw, list_of_axes
@@ -329,19 +330,43 @@ class Placement(Table):
 Share = Annotated[float, Field(strict=True, ge=0, le=1)]
 
 
+def _share_or_rules(value: object, share: ValidatorFunctionWrapHandler) -> Any:
+    """Return a fraction, or a tuple of rules from a table or a list of tables."""
+    rules = [value] if isinstance(value, dict) else value
+    if not isinstance(rules, list):
+        return share(value)
+    if not rules or not all(isinstance(rule, dict) and rule for rule in rules):
+        raise flaw(f"must be a fraction, or tables of keys and what of them is held out; found {written(value)}")
+    return tuple(rules)
+
+
+# A fraction, or what the split holds out; `sweep_file` checks keys and values.
+ShareOrRules = Annotated[Share, WrapValidator(_share_or_rules)]
+
+
 class Split(Table):
-    """Fractions of the trajectories by split; their sum is 1."""
+    """Fractions of the trajectories by split; their sum is 1. Rules in place of one take theirs out before."""
 
     train: Annotated[Share, Field(description="Fraction to train with, 0 to 1.")] = 0.0
-    valid: Annotated[Share, Field(description="Fraction to choose parameters with, 0 to 1.")] = 0.0
-    test: Annotated[Share, Field(description="Fraction to measure errors with, 0 to 1.")] = 0.0
+    valid: Annotated[ShareOrRules, Field(description="Fraction to choose parameters with, 0 to 1, or rules.")] = 0.0
+    test: Annotated[ShareOrRules, Field(description="Fraction to measure errors with, 0 to 1, or rules.")] = 0.0
 
     @model_validator(mode="after")
     def _whole(self) -> "Split":
-        total = self.train + self.valid + self.test
+        total = sum(self.shares.values())
         if abs(total - 1) > ROUND_OFF:
             raise flaw(f"must make 1 together, as train = 0.8, valid = 0.1, test = 0.1 do; found {total:g}")
         return self
+
+    @property
+    def shares(self) -> dict[str, float]:
+        """The fractions; 0 of a split with rules."""
+        return {name: 0.0 if isinstance(part, tuple) else part for name, part in self}
+
+    @property
+    def rules(self) -> Rules:
+        """The rules of splits that have them."""
+        return {name: part for name, part in self if isinstance(part, tuple)}
 
 
 class Certify(Table):
@@ -431,7 +456,7 @@ class Sweep:
         """
         vary, place = self.data.get("vary", {}), self.data.get("place", [])
         content = {name: getattr(self, name) for name in ("count", "seed", "method", "accept")}
-        content |= {"base": self.base_data, "vary": list(vary.items()), "split": self.split.model_dump()}
+        content |= {"base": self.base_data, "vary": list(vary.items()), "split": dict(self.split)}
         content["place"] = [place] if isinstance(place, dict) else place
         return sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()
 
@@ -440,19 +465,33 @@ class Sweep:
         """All distributions by key: those of `vary`, then those of the placements, such as `place.sand.size`."""
         return self.vary | {key: one for place in self.placements for key, one in place.distributions.items()}
 
-    def split_of(self, number: int) -> str:
-        """Return "train", "valid" or "test" for a trajectory.
+    @cached_property
+    def drawn_once(self) -> dict[str, Distribution]:
+        """The distributions with one value in each trajectory: those of `vary`, and the counts of placements."""
+        return {key: one for key, one in self.distributions.items() if key in self.vary or key.endswith(".count")}
 
-        [0, 1] is divided into consecutive intervals as long as the fractions. Each group of TOGETHER consecutive
-        trajectories has one in each of TOGETHER equal parts of [0, 1], in an order drawn from the seed. Therefore a
-        trajectory keeps its split when the count grows, each split has its fraction of the first n trajectories for
-        every n, to within about 3, and no grid of values of any length correlates with the splits.
+    def values_of(self, number: int) -> dict[str, Any]:
+        """Return the values of `drawn_once` in a trajectory."""
+        values = TrajectoryValues(self, number, {})
+        return {key: values.value(key, key, one) for key, one in self.drawn_once.items()}
+
+    def split_of(self, number: int, particles: int | None = None) -> str:
+        """Return "train", "valid" or "test" for a trajectory; unknown `particles` meet no rule.
+
+        That of the first rule that it meets. Else [0, 1] is divided into consecutive intervals as long as the
+        fractions. Each group of TOGETHER consecutive trajectories has one in each of TOGETHER equal parts of [0, 1], in
+        an order drawn from the seed. Therefore a trajectory keeps its split when the count grows, each split has its
+        fraction of the first n trajectories for every n, to within about 3, and no grid of values of any length
+        correlates with the splits.
         """
+        rules = self.split.rules
+        if rules and (held := held_in(rules, self.values_of(number), particles)):
+            return held
         group, member = divmod(number, TOGETHER)
         offset, order = _split_order(self.seed, group)
         place = (order[member] + offset) / TOGETHER
         last, total = "train", 0.0
-        for name, share in self.split:
+        for name, share in self.split.shares.items():
             total += share
             last = name if share > 0 else last
             if share > 0 and place < total:

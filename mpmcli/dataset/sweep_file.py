@@ -3,6 +3,7 @@
 import copy
 import re
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path as File
@@ -12,8 +13,9 @@ import tomli_w
 from pydantic import ValidationError
 
 from mpmcli.dataset.draw import PlacementError, draw, template_extent
+from mpmcli.dataset.hold_out import PARTICLES, is_range, meets
 from mpmcli.dataset.image_folder import image_frames
-from mpmcli.dataset.sweep import ROUND_OFF, Placement, Sweep, SweepTable, is_number
+from mpmcli.dataset.sweep import ROUND_OFF, Numbers, Placement, Sweep, SweepTable, is_number
 from mpmcli.errors import InputError
 from mpmcli.scene import Scene, parse_scene
 from mpmcli.scene.camera_file import valid_cameras
@@ -21,11 +23,14 @@ from mpmcli.scene.load import read_scene, report, scene_problems
 from mpmcli.scene.material import Laws
 from mpmcli.scene.points import absence
 from mpmcli.scene.problem import Path, Problem, hint_at, listed, path_text, problems_of, quoted, several, written
-from mpmcli.scene.quantity import AXES, NUMBER_WORDS, dimension_of
+from mpmcli.scene.quantity import AXES, LARGEST, NUMBER_WORDS, dimension_of
+from mpmcli.scene.sampling import count_sources
 from mpmcli.scene.shapes import COMBINED
 from mpmcli.scene.toml_file import apply_overrides, key_parts, read_toml, set_value
 
 MOST_BODIES = 1000
+# Trajectories in which rules of splits are tried.
+MOST_DRAWN = 2000
 # The key of a placement by the list that its template is in.
 KINDS = {"bodies": "body", "colliders": "collider"}
 
@@ -56,10 +61,11 @@ def load_sweep(
     base_text = base_text or tomli_w.dumps(base_data)
     same = {name: getattr(table, name) for name in SweepTable.model_fields if name not in ("base", "place")}
     sweep = Sweep(File(path), text, data, base, base_text, base_data, placements=table.place, **same)
-    problems = list(_misplaced(sweep))
+    problems = [*_misplaced(sweep), *_misheld(sweep)]
     if not problems:
         set_by, problems = _owners(sweep)
         problems = problems or _faulty_scenes(sweep, laws, set_by)
+    problems = problems or _emptied(sweep, laws)
     if not problems and sweep.images:
         sweep, problems = _with_cameras(sweep, laws)
     if problems:
@@ -102,10 +108,65 @@ def _base_file(path: File, text: str, data: dict[str, Any]) -> File:
 
 
 def _as_written(problem: Problem, data: dict[str, Any]) -> Problem:
-    """Remove the index from the path of a placement if the file has one [place] table instead of a list."""
+    """Remove the index from the path of a placement or a rule if the file has one table instead of a list."""
     if problem.path[:1] == ("place",) and isinstance(data["place"], dict):
         return Problem(("place", *problem.path[2:]), problem.sentence)
+    if problem.path[:1] == ("split",) and len(problem.path) > 2 and isinstance(data["split"][problem.path[1]], dict):
+        return Problem((*problem.path[:2], *problem.path[3:]), problem.sentence)
     return problem
+
+
+def _misheld(sweep: Sweep) -> Iterator[Problem]:
+    """Find keys and values that no split can hold out."""
+    ends: dict[str, list[Any]] = {PARTICLES: [0, LARGEST]}
+    for key, one in sweep.drawn_once.items():
+        values = one.extremes()
+        if isinstance(one, Numbers) and one.vector:
+            ends |= {f"{key}.{k}": list(both) for k, both in enumerate(zip(*values, strict=True))}
+        elif len(values) > 1:
+            ends[key] = values
+    for split, rules in sweep.split.rules.items():
+        for k, rule in enumerate(rules):
+            for key, given in rule.items():
+                if said := _not_held(key, given, ends):
+                    yield Problem(("split", split, k, key), said)
+
+
+def _not_held(key: str, given: object, ends: dict[str, list[Any]]) -> str:
+    """Return why a condition of a rule is wrong, by the values at the ends of each key, or all; "" if it is right."""
+    if key not in ends:
+        parts = [known for known in ends if known.startswith(f"{key}.")]
+        return f"no key that varies; {hint_at(key, parts[:1] or [*ends], f'those are {several(quoted([*ends]))}')}"
+    drawn = ends[key]
+    if not all(map(is_number, drawn)):
+        if not isinstance(given, list) or not given or not all(one in drawn for one in given):
+            values = several([written(one) for one in drawn])
+            return f"must be a list of values that it draws, {values}; found {written(given)}"
+        return ""
+    if not is_range(given) or not all(map(is_number, given)) or given[0] > given[1]:
+        return f"must be a range, [lower, upper]; found {written(given)}"
+    low, high = min(drawn), max(drawn)
+    return "" if given[0] <= high and given[1] >= low else f"is from {low:g} to {high:g}; {written(given)} is outside"
+
+
+def _emptied(sweep: Sweep, laws: Laws) -> list[Problem]:
+    """Find rules that hold out none of the trajectories, or all; of many trajectories only some are looked at."""
+    rules = {("split", split, k): rule for split, its in sweep.split.rules.items() for k, rule in enumerate(its)}
+    counting, unmet, rest = any(PARTICLES in rule for rule in rules.values()), {**rules}, False
+    for number in range(min(sweep.count, MOST_DRAWN)):
+        if rest and not unmet:
+            break
+        draws, particles = sweep.values_of(number), None
+        if counting:
+            with suppress(InputError):
+                particles = sum(count_sources(draw(sweep, number).scene(laws).scene))
+        met = [path for path, rule in rules.items() if meets(rule, draws, particles)]
+        rest, unmet = rest or not met, {path: rule for path, rule in unmet.items() if path not in met}
+    if sweep.count > MOST_DRAWN:
+        return []
+    said = f"holds out none of the {sweep.count} trajectories: raise count, or widen it"
+    all_out = "the rules hold out all trajectories, and leave none for the fractions: narrow them"
+    return [Problem(path, said) for path in unmet] + [Problem(("split",), all_out)] * (not rest)
 
 
 def _misplaced(sweep: Sweep) -> Iterator[Problem]:

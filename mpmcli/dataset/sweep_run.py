@@ -243,6 +243,7 @@ def open_folder(
         # Another sweep may have started and ended meanwhile.
         require_empty(directory, locked=True)
     facts = {"key": sweep.key, "count": sweep.count, "seed": sweep.seed, "accept": sweep.accept, "files": digests}
+    facts |= {"hold_out": sweep.split.rules} if sweep.split.rules else {}
     facts |= {"certify": certify_plan(sweep)} if sweep.certify else {}
     facts |= {"images": images_plan(sweep)} if sweep.images else {}
     for name, text in texts.items():
@@ -565,9 +566,11 @@ def rehearse(sweep: Sweep, settings: SweepSettings) -> Rehearsal:
         except InputError as error:
             fault = str(error)
         siblings = counts[-1] * cost_of_one(sweep) if number in plan["numbers"] else 0.0
-        found.append(Rehearsed(number, sweep.split_of(number), values, *counts, fault, siblings, frames))
+        found.append(
+            Rehearsed(number, sweep.split_of(number, counts[0] or None), values, *counts, fault, siblings, frames)
+        )
     used = {sweep.split_of(number) for number in range(min(sweep.count, SURE))}
-    empty = tuple(name for name, share in sweep.split if share > 0 and name not in used)
+    empty = tuple(name for name, share in sweep.split.shares.items() if share > 0 and name not in used)
     text = plan_text(sweep.count, **plan) if sweep.certify else ""
     return Rehearsal(tuple(found), settings.processes, empty, text, cost)
 
