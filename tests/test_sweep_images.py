@@ -15,7 +15,7 @@ from mpmcli.dataset import images
 from mpmcli.dataset import open as open_dataset
 from mpmcli.dataset.draw import draw
 from mpmcli.dataset.merge import merge
-from mpmcli.dataset.report import verify
+from mpmcli.dataset.report import status_of, verify
 from mpmcli.dataset.sweep_run import SweepSettings, run_sweep
 from mpmcli.errors import InputError
 
@@ -72,6 +72,8 @@ def test_images_are_the_same_however_the_sweep_was_computed(monkeypatch: pytest.
         states.append(run_sweep(sweep_of(IMAGES, count=COUNT), SweepSettings(Path("broken"), resume=True), stop=stop))
     assert len(states) > 2 and sum(state.imaged for state in states) == 5 and contents(Path("broken")) == truth
     made("later", SWEEP)
+    assert (status_of(Path("later")).imaged, status_of(Path("broken")).imaged) == (None, 5)
+    assert "images    5" in status_of(Path("broken")).text()
     assert contents(made("later", resume=True)) == truth
     assert contents(made("later", overwrite=True)) == truth
     # Nor do they stay where none are asked for.

@@ -37,7 +37,7 @@ from mpmcli.dataset.shard import (
     open_shard,
 )
 from mpmcli.errors import InputError
-from mpmcli.output.checksums import checksum_is_right
+from mpmcli.output.checksums import SUMS, checksum_is_right
 from mpmcli.output.durable import sealed, write_text, writing
 from mpmcli.plain_text import counted, markdown_table, one_line, size_text
 from mpmcli.render.picture_file import digest_of
@@ -50,7 +50,8 @@ MOST_NAMED = 10
 class Status:
     """Counts of a dataset with `part` (i, n) of a sweep: `expected` trajectories, and `rows` of those tried.
 
-    `missing` files of trajectories do not exist; trajectories with the numbers `waiting` have not been tried.
+    `missing` files of trajectories do not exist; trajectories with the numbers `waiting` have not been tried; `imaged`
+    is the number of those with images, None if the sweep asks for none.
     """
 
     path: Path
@@ -59,6 +60,7 @@ class Status:
     rows: tuple[Row, ...]
     missing: frozenset[str] = frozenset()
     waiting: frozenset[int] = frozenset()
+    imaged: int | None = None
 
     @property
     def accepted(self) -> int:
@@ -82,6 +84,7 @@ class Status:
             "done": len(self.rows),
             "missing": self.absent,
             "accepted": self.accepted,
+            "imaged": self.imaged,
             "retried": sum(row.retries > 0 for row in self.rows),
             "verdicts": {verdict: verdicts[verdict] for verdict in VERDICTS},
             "splits": dict(sorted(splits.items())),
@@ -110,6 +113,7 @@ class Status:
         lines += [f"  {name} is missing" for name in sorted(self.missing)]
         lines += [f"  {verdict:<9} {count}" for verdict, count in told["verdicts"].items() if count]
         lines += [f"  {split:<9} {count}" for split, count in told["splits"].items()]
+        lines += [f"  images    {self.imaged}"] * (self.imaged is not None)
         excluded = told["excluded"]
         lines += [f"  {one['number']:06d} {one['verdict']}: {one['reason']}" for one in excluded[:MOST_NAMED]]
         if len(excluded) > MOST_NAMED:
@@ -124,7 +128,9 @@ def status_of(path: Path) -> Status:
     folder = Folder(path, facts["count"], facts["per_shard"], tuple(facts["part"]))
     missing = frozenset(name for name in {row.file for row in rows} if name and not (path / name).is_file())
     waiting = frozenset(folder.all_numbers()) - {row.number for row in rows}
-    return Status(path, folder.part, folder.expected, tuple(rows), missing, waiting)
+    places = [path / IMAGES / group_name(row.number) / SUMS for row in rows if row.accepted]
+    imaged = sum(place.exists() for place in places) if "images" in facts else None
+    return Status(path, folder.part, folder.expected, tuple(rows), missing, waiting, imaged)
 
 
 @dataclass(frozen=True)
