@@ -208,11 +208,13 @@ def _places(
     low, h = header.origin, header.spacing
     edge = MAP_CELLS * h
     nodes = Map(low - edge, edge, tuple(int(n) + 4 for n in np.ceil((header.upper - low) / edge)))
+    # Cells, numbered; predictions may leave the domain.
+    strides = (2**20) ** np.arange(x.shape[-1])
     density, volume = np.zeros(len(x)), np.zeros(len(x))
     for k, here in enumerate(present):
         shares = [nodes.shares(z[k, here], mass[here]) for z in (x, y)]
         density[k] = 0.5 * np.abs(shares[1] - shares[0]).sum()
-        filled = [len(np.unique(np.floor((z[k, here] - low) / h), axis=0)) for z in (x, y)]
+        filled = [len(np.unique(np.floor((z[k, here] - low) / h).astype(int) @ strides)) for z in (x, y)]
         volume[k] = filled[1] / max(filled[0], 1) - 1
     return {"density": density, "volume": np.abs(volume)}
 
