@@ -139,8 +139,8 @@ def sinkhorn_divergence(x: np.ndarray, y: np.ndarray, period: np.ndarray) -> flo
     y = x + s without a period.
     """
     costs = [(nearest_image(a[:, None] - b[None], period) ** 2).sum(-1) for a, b in ((x, y), (x, x), (y, y))]
-    # Clouds of one point have no cost of their own.
-    smoothing = SMOOTHING * max(costs[0].mean(), np.finfo(float).tiny)
+    # Clouds of one point may have no cost.
+    smoothing = max(SMOOTHING * costs[0].mean(), np.finfo(float).tiny)
     between, of_x, of_y = (_transport(cost, smoothing) for cost in costs)
     return between - (of_x + of_y) / 2
 
@@ -191,11 +191,11 @@ def _motion(
     v, w = (nearest_image(np.diff(z, axis=0), period) / pause for z in (x, y))
     energies = [0.5 * (mass * both * (u**2).sum(-1)).sum(1) for u in (v, w)]
     change = ((mass * both)[..., None] * (w - v)).sum(1)
-    most = max(energies[0].max(initial=0.0), np.finfo(float).tiny)
+    least, most = np.finfo(float).tiny, energies[0].max(initial=0.0)
     heaviest = (mass * both).sum(1).max(initial=0.0)
     errors = {
-        "energy": np.abs(energies[1] - energies[0]) / most,
-        "momentum": np.linalg.norm(change, axis=-1) / np.sqrt(2 * max(heaviest, np.finfo(float).tiny) * most),
+        "energy": np.abs(energies[1] - energies[0]) / max(most, least),
+        "momentum": np.linalg.norm(change, axis=-1) / np.sqrt(max(2 * heaviest * most, least)),
     }
     return {name: np.concatenate([[np.nan], error]) for name, error in errors.items()}
 
