@@ -143,6 +143,7 @@ def test_when_a_rollout_leaves_the_error_bar(dataset: Dataset) -> None:
         (lambda x: {"0": x, "origin": [0.0]}, "origin has 1 coordinates, and the trajectory 2"),
         (lambda x: {"0": x, "seconds": [1.0, 2.0]}, "seconds has 2 entries for 1 rollout"),
         (lambda x: {"first": x}, 'has an array "first": name rollouts by the numbers'),
+        (lambda x: {"0": x.astype(str)}, 'the array "0" does not hold numbers'),
         (lambda x: {"frames": [0]}, "has no rollout"),
     ],
 )
@@ -170,9 +171,11 @@ def test_the_command(dataset: Dataset, tmp_path: Path) -> None:
     assert done.status == 0 and "4 rollouts" in done.stdout and "MSE of LagrangeBench" in done.stdout
     told = json.loads(run_here("score", dataset.path, "--rollouts", file, "--json").stdout)
     assert told["horizons"]["11"]["mse"] == pytest.approx(SHIFT**2)
-    file.write_text("x", encoding="utf-8")
-    done = run_here("score", dataset.path, "--rollouts", file)
-    assert done.status == 2 and "is no file of rollouts" in done.stderr
+    whole = file.read_bytes()
+    for content in (b"x", whole[:-100], whole[:3000] + bytes(8) + whole[3008:]):
+        file.write_bytes(content)
+        done = run_here("score", dataset.path, "--rollouts", file)
+        assert done.status == 2 and "is no file of rollouts" in done.stderr
 
 
 def test_the_solver_is_scored_on_coarser_grids(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

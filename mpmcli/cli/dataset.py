@@ -284,10 +284,13 @@ def score_command(
         return
     from mpmcli.cli.progress import ProgressBar
     from mpmcli.dataset.baseline import RATIOS, chosen, compare
+    from mpmcli.render.picture_file import require_writable
 
+    if figure:
+        require_writable(figure)
     numbers = [one.number for one in predicted] or chosen(opened)
     with ProgressBar(len(RATIOS) * len(numbers), "runs", quiet=quiet) as bar:
-        compared = compare(opened, numbers, predicted, arch, bar.show)
+        compared = compare(opened, numbers, predicted, arch, bar.show, lambda: bool(interrupt_came()))
     if figure:
         compared.draw(figure)
     print_answer(compared, as_json, quiet=quiet)

@@ -17,10 +17,11 @@ from mpmcli.dataset.score import COLUMNS, Rollout, Score, score_rollouts
 from mpmcli.error_bars.siblings import LeftOut, Reach, coarser, tables_of
 from mpmcli.errors import InputError, MpmcliError
 from mpmcli.materials.registry import parameter_models
-from mpmcli.output.durable import sealed
+from mpmcli.output.durable import sealed, writing
 from mpmcli.plain_text import plain_number, text_table
 from mpmcli.plot.style import LIGHT_SERIES, THEMES, drawing, svg
 from mpmcli.scene import Scene, parse_scene, sample_bodies
+from mpmcli.scene.problem import listed
 from mpmcli.simulation.engine import Arch
 from mpmcli.simulation.runner import Runner
 
@@ -42,6 +43,7 @@ def compare(
     predicted: Sequence[Rollout],
     arch: Arch = "auto",
     watch: Callable[[int], None] = lambda _: None,
+    stop: Callable[[], bool] = lambda: False,
 ) -> "Comparison":
     """Score the solver on grids RATIOS times as coarse, beside predicted rollouts.
 
@@ -50,9 +52,11 @@ def compare(
         predicted: rollouts of these trajectories, or none.
         arch: backend of the solver.
         watch: called with the number of runs that are done.
+        stop: asked whether to end.
 
     Raises:
         InputError: the scene of a trajectory cannot be computed again.
+        KeyboardInterrupt: `stop` returned True.
     """
     runner, done = Runner(arch), 0
     frames = {number: np.arange(dataset[number].frame_count) for number in numbers}
@@ -60,26 +64,33 @@ def compare(
     found = {"rollouts": list(predicted)} if predicted else {}
     for ratio in RATIOS:
         for number in numbers:
-            rollout = _rollout(dataset, number, frames[number], ratio, runner)
+            rollout = _rollout(dataset, number, frames[number], ratio, runner, stop)
             if rollout is not None:
                 found.setdefault(f"spacing x {ratio:g}", []).append(rollout)
             watch(done := done + 1)
+    if not found:
+        raise InputError(f"{dataset.path}: none of the trajectories {listed(map(str, numbers))} reaches its end again.")
     return Comparison({name: score_rollouts(dataset, own) for name, own in found.items()})
 
 
-def _rollout(dataset: Dataset, number: int, frames: np.ndarray, ratio: float, runner: Runner) -> Rollout | None:
+def _rollout(
+    dataset: Dataset, number: int, frames: np.ndarray, ratio: float, runner: Runner, stop: Callable[[], bool]
+) -> Rollout | None:
     """Return a trajectory on a coarser grid; None: none fits, or its run did not reach the end."""
     trajectory = dataset[number]
     scene = _scene_of(dataset.path, trajectory)
     particles, tables = sample_bodies(scene), tables_of(scene)
-    if scene.emitters:
-        raise InputError(f"trajectory {number} has emitters: a coarser grid would emit other particles.")
+    if scene.emitters or not particles or trajectory.header.drops:
+        raise InputError(f"trajectory {number} has emitters, no particles, or frames without some of its particles.")
     start = np.concatenate([body.position for body in particles])
     x = trajectory.position
     if start.shape != x[0].shape or np.abs(start - x[0]).max() > SAME_PLACE * scene.domain.spacing:
         raise InputError(f"trajectory {number} starts elsewhere than its scene says: it cannot be computed again.")
     if ratio > 1:
         low, high = x.min((0, 1)), x.max((0, 1))
+        if any(collider.free for collider in scene.colliders):
+            # Rigid bodies may come near all walls.
+            low, high = np.array(scene.domain.origin), np.array(scene.domain.upper)
         sibling = coarser(tables, Reach(low, high, (x[0].min(0) + x[0].max(0)) / 2), ratio)
         if isinstance(sibling, LeftOut):
             return None
@@ -88,7 +99,7 @@ def _rollout(dataset: Dataset, number: int, frames: np.ndarray, ratio: float, ru
     coarse = parse_scene(tables, laws=parameter_models(), directory=dataset.path).scene
     try:
         # The first run may compile, and the machine may be busy.
-        runs = [runner.run(coarse, particles=particles) for _ in range(2)]
+        runs = [runner.run(coarse, stop, particles=particles) for _ in range(2)]
     except MpmcliError as error:
         raise InputError(f"trajectory {number} cannot be computed on a grid {ratio:g} times coarser: {error}") from None
     if len(runs[-1].frames) < len(x):
@@ -99,7 +110,7 @@ def _rollout(dataset: Dataset, number: int, frames: np.ndarray, ratio: float, ru
 
 def _scene_of(directory: Path, trajectory: Trajectory) -> Scene:
     """Return the scene of a trajectory from its header; InputError: it cannot be read here."""
-    text = trajectory.header.stored["scene"]
+    text = trajectory.header.stored.get("scene", "")
     source = f"the scene of trajectory {trajectory.number}"
     return parse_scene(tomllib.loads(text), laws=parameter_models(), source=source, directory=directory).scene
 
@@ -126,7 +137,7 @@ class Comparison:
         return f"{head}\n\n{text_table(('predictor', 'seconds', *names), rows, {0})}"
 
     def draw(self, path: Path) -> None:
-        """Write a figure of the root of the mean square over the seconds of a rollout, as SVG; OSError: it failed."""
+        """Write a figure of the root of the mean square over the seconds of a rollout, as SVG; RunError: it failed."""
         with drawing(SIZE, THEMES["light"]) as figure:
             axes = figure.subplots()
             for name, one in self.scores.items():
@@ -136,7 +147,7 @@ class Comparison:
                     axes.annotate(name, (one.seconds, error), (5, 5), textcoords="offset points")
             axes.set(xscale="log", yscale="log", xlabel="seconds per rollout", ylabel="root mean square error, m")
             axes.margins(0.2)
-            with sealed(path, unique=True) as unsealed:
+            with writing(path), sealed(path, unique=True) as unsealed:
                 unsealed.write_bytes(svg(figure))
 
 

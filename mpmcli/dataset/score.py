@@ -6,10 +6,12 @@ its coordinates are 0, and `seconds`, the time that a rollout took: one number, 
 """
 
 import re
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import h5py
 import numpy as np
@@ -18,6 +20,7 @@ from mpmcli.dataset.dataset import Dataset, Trajectory
 from mpmcli.error_bars.observables import MAP_CELLS, Map
 from mpmcli.errors import InputError
 from mpmcli.frames.frame import ACTIVE, STATUS
+from mpmcli.output.checksums import DAMAGE, first_line
 from mpmcli.output.header import nearest_image
 from mpmcli.plain_text import counted, plain_number, text_table
 
@@ -92,11 +95,16 @@ def _arrays(path: Path) -> dict[str, np.ndarray]:
     try:
         if h5py.is_hdf5(path):
             with h5py.File(path) as file:
-                return {name: np.asarray(entry) for name, entry in file.items()}
-        with np.load(path, allow_pickle=False) as file:
-            return dict(file)
-    except (OSError, ValueError, EOFError, TypeError, KeyError, AttributeError) as error:
-        raise InputError(f"{path} is no file of rollouts, .npz or HDF5 with arrays of numbers ({error}).") from None
+                arrays = {name: np.asarray(entry) for name, entry in file.items()}
+        else:
+            # NumPy leaves a damaged file open.
+            with path.open("rb") as stored, np.load(stored, allow_pickle=False) as file:
+                arrays = dict(file)
+    except (*DAMAGE, BadZipFile, zlib.error) as error:
+        raise InputError(f"{path} is no file of rollouts, .npz or HDF5 ({first_line(error)}).") from None
+    for name in (name for name, array in arrays.items() if array.dtype.kind not in "iuf"):
+        raise InputError(f'{path}: the array "{name}" does not hold numbers.')
+    return arrays
 
 
 def _rollout(
@@ -170,10 +178,9 @@ def score(trajectory: Trajectory, rollout: Rollout) -> dict[str, np.ndarray]:
     way = nearest_image(y - x, header.period)
     total = np.maximum((mass * present).sum(1), np.finfo(float).tiny)
     centre = ((mass * present)[..., None] * way).sum(1) / total[:, None]
-    inner = np.array([rows % STRIDE == rows[0] % STRIDE]).ravel()
     chosen = np.linspace(0, x.shape[1] - 1, min(x.shape[1], MOST_PARTICLES)).astype(int)
     divergence = np.full(len(x), np.nan)
-    for k in np.flatnonzero(inner):
+    for k in range(0, len(x), STRIDE):
         own = chosen[present[k, chosen]]
         divergence[k] = sinkhorn_divergence(x[k, own], y[k, own], header.period) if len(own) else 0.0
     outside = [_outside(trajectory, rows, z, present) for z in (y, x)]
