@@ -90,6 +90,7 @@ def read_rollouts(path: Path, dataset: Dataset) -> list[Rollout]:
 
 
 def _arrays(path: Path) -> dict[str, np.ndarray]:
+    """Return the arrays of a file by name; InputError: it is missing or damaged, or some are not of numbers."""
     if not path.is_file():
         raise InputError(f"{path} does not exist: give a file of rollouts, .npz or HDF5.")
     try:
